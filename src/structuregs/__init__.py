@@ -1,0 +1,1 @@
+"""structuregs: photos of an articulated object in two states go in; a working digital twin comes out."""

@@ -1,0 +1,62 @@
+"""Pinhole cameras."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .se3 import SE3
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+
+    Attributes:
+        T_world_camera: its pose, one motion without batch.
+        fx, fy, cx, cy: focal lengths and principal point, pixels.
+        width, height: of its images, pixels.
+    """
+
+    T_world_camera: SE3
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view on an image of another size."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(self.T_world_camera, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
+
+    @property
+    def K(self) -> Float[Tensor, "3 3"]:
+        """Intrinsic matrix, pixels."""
+        return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    @property
+    def centre(self) -> Float[Tensor, " 3"]:
+        """Its position in the world."""
+        return self.T_world_camera.xyz
+
+    def project(self, points_world: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+        """Pixel positions and depths along z of world points; points behind the camera have depth <= 0."""
+        p = self.T_world_camera.inverse().to(dtype=points_world.dtype).apply(points_world)
+        z = p[..., 2]
+        safe = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+        return torch.stack([self.fx * p[..., 0] / safe + self.cx, self.fy * p[..., 1] / safe + self.cy], -1), z
+
+    def rays(self, pixels: Float[Tensor, "*batch 2"] | None = None) -> tuple[Float[Tensor, " 3"], Float[Tensor, "*batch 3"]]:
+        """Origin and directions of the rays through `pixels` (default: every pixel's centre, as `H W 3`).
+
+        Directions have unit z in the camera's frame, so a ray's parameter is the depth along z.
+        """
+        if pixels is None:
+            v, u = torch.meshgrid(torch.arange(self.height) + 0.5, torch.arange(self.width) + 0.5, indexing="ij")
+            pixels = torch.stack([u, v], -1)
+        x, y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        d = torch.stack([x, y, torch.ones_like(x)], -1)
+        return self.centre, d @ self.T_world_camera.rotation.to(d.dtype).T

@@ -1,0 +1,57 @@
+"""Screws: the axis, pivot and amount of a rigid motion."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .se3 import SE3
+
+JointKind = Literal["revolute", "prismatic"]
+
+
+@dataclass(frozen=True)
+class Screw:
+    """A motion of one degree of freedom.
+
+    Attributes:
+        kind: turning about the line through `origin` along `axis`, or sliding along `axis`.
+        axis: unit vector.
+        origin: a point of the axis of a turn; where the axis is drawn for a slide.
+    """
+
+    kind: JointKind
+    axis: Float[Tensor, " 3"]
+    origin: Float[Tensor, " 3"]
+
+    def motion(self, q: float | Float[Tensor, ""]) -> SE3:
+        """The rigid motion by `q` radians (revolute) or units of length (prismatic)."""
+        q = torch.as_tensor(q, dtype=self.axis.dtype, device=self.axis.device)
+        if self.kind == "prismatic":
+            return SE3.exp(torch.cat([q * self.axis, torch.zeros_like(self.axis)]))
+        turn = SE3.exp(torch.cat([torch.zeros_like(self.axis), q * self.axis]))
+        return SE3.from_quat(turn.wxyz, self.origin - turn.apply(self.origin))
+
+
+def screw_of_motion(T: SE3, kind: JointKind) -> tuple[Screw, float]:
+    """The screw of a given kind closest to a motion, and its amount `q` (radians or units of length), q >= 0.
+
+    Supplement 1.4. Prismatic: the translation's direction and norm.  Revolute: axis and angle of the rotation, the
+    pivot the minimum-norm least-squares solution of (R - I) p = -t; the part of t along the axis is dropped.
+    """
+    t = T.xyz
+    if kind == "prismatic":
+        length = float(t.norm())
+        axis = t / length if length > 0 else torch.tensor([0.0, 0, 1], dtype=t.dtype, device=t.device)
+        return Screw("prismatic", axis, torch.zeros_like(t)), length
+    omega = T.log()[3:]
+    angle = float(omega.norm())
+    axis = omega / angle if angle > 0 else torch.tensor([0.0, 0, 1], dtype=t.dtype, device=t.device)
+    across = t - axis * (axis @ t)
+    # On the plane across the axis, (I - R)^-1 in closed form; the solution has no component along the axis.
+    half = angle / 2
+    cot = 1 / torch.tan(torch.tensor(half, dtype=t.dtype)).clamp(min=1e-12)
+    origin = 0.5 * (across + cot.to(t.device) * torch.linalg.cross(axis, across))
+    return Screw("revolute", axis, origin), angle
