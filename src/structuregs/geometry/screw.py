@@ -1,5 +1,6 @@
 """Screws: the axis, pivot and amount of a rigid motion."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -51,7 +52,6 @@ def screw_of_motion(T: SE3, kind: JointKind) -> tuple[Screw, float]:
     axis = omega / angle if angle > 0 else torch.tensor([0.0, 0, 1], dtype=t.dtype, device=t.device)
     across = t - axis * (axis @ t)
     # On the plane across the axis, (I - R)^-1 in closed form; the solution has no component along the axis.
-    half = angle / 2
-    cot = 1 / torch.tan(torch.tensor(half, dtype=t.dtype)).clamp(min=1e-12)
-    origin = 0.5 * (across + cot.to(t.device) * torch.linalg.cross(axis, across))
+    cot = math.cos(angle / 2) / max(math.sin(angle / 2), 1e-12)
+    origin = 0.5 * (across + cot * torch.linalg.cross(axis, across))
     return Screw("revolute", axis, origin), angle

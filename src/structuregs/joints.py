@@ -1,0 +1,152 @@
+"""Joints read off the motions of parts: type, axis, pivot, displacement (supplement 1.4), and how clear they are."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .geometry import SE3, JointKind, Screw, screw_of_motion
+from .model import ArticulatedObject, Joint, PosedParts
+
+PRISMATIC_BELOW_DEG = 5.0  # supplement 1.4
+_REVIEW_BELOW = 0.5
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """A part and its motion, all that a judgement of its joint looks at (float64)."""
+
+    motion: SE3
+    centre: Float[Tensor, " 3"]
+    corners: Float[Tensor, "8 3"]
+    splats: float
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal of the part's box."""
+        return max(float((self.corners[0] - self.centre).norm()), 1e-12)
+
+    @property
+    def travel(self) -> float:
+        """How far the box's corners move, root mean square."""
+        return float((self.motion.apply(self.corners) - self.corners).square().sum(-1).mean().sqrt())
+
+
+def kind_of(motion: SE3) -> JointKind:
+    """The joint's type by the supplement's rule: "prismatic" where the rotation is below 5 degrees (1.4)."""
+    return "prismatic" if math.degrees(float(motion.angle)) < PRISMATIC_BELOW_DEG else "revolute"
+
+
+def screw_of_part(motion: SE3, kind: JointKind, centre: Float[Tensor, " 3"]) -> tuple[Screw, float]:
+    """The screw of a given kind closest to a part's motion and its amount `q >= 0`, in float64.
+
+    The motion is read at the part's centre.  So a slide is the way the part went (the translation of a motion that
+    also turns a little depends on where the world's origin lies), and a turn's origin is the axis's point nearest to
+    the part.
+
+    Args:
+        motion: from state 0 to state 1, in the world.
+        kind: which of the two screws.
+        centre: the centre of the part in state 0, in the world.
+    """
+    centre = centre.double()
+    motion = _double(motion)
+    at_centre = SE3.from_quat(motion.wxyz, motion.apply(centre) - centre)
+    screw, q = screw_of_motion(at_centre, kind)
+    return replace(screw, origin=screw.origin + centre), q
+
+
+def constrain(motion: SE3, kind: JointKind, centre: Float[Tensor, " 3"]) -> SE3:
+    """The motion of exactly one degree of freedom that is closest to `motion` at a part's centre, float64.
+
+    Arguments as in `screw_of_part`.
+    """
+    screw, q = screw_of_part(motion, kind, centre)
+    return screw.motion(q)
+
+
+def joints_of(parts: PosedParts, kinds: Sequence[JointKind] | None = None) -> tuple[Joint, ...]:
+    """The joint of every moving part against the base, with its confidence.
+
+    The confidence is a product of scores, each clipped to [0, 1]; `r` is half the diagonal of the part's box:
+
+    - type: `|ln(angle / 5 deg)| / ln 3`: 0 on the boundary between the types, 1 a factor of three away from it;
+    - travel: what the box's corners move (rms), over `r / 10`;
+    - slide, of a turn: `1 - 2 h / r`, for the slide `h` along the axis that no joint explains;
+    - reach, of a turn: `2 - d / (1.5 r)`, for the distance `d` of the axis from the box's centre: 1 for a hinge at
+      the box, 0 from `3 r` on, where a slide looks the same;
+    - splats: the sum of the part's opacities, over 100.
+
+    `review` is the sentence of the lowest score where that is below one half.
+
+    Args:
+        parts: the base and the moving parts.
+        kinds: the types of the moving parts where they are already settled; the supplement's rule otherwise.
+    """
+    parts = parts.detach()
+    opacities = parts.splats.opacities.split(parts.counts)
+    rows = []
+    for k in range(1, len(parts)):
+        box, motion = parts.boxes[k], _double(parts.motions[k])
+        moved = _Moved(motion, box.T_world_box.xyz.double(), box.corners.double(), float(opacities[k].sum()))
+        rows.append(_joint(moved, kinds[k - 1] if kinds is not None else kind_of(motion)))
+    return tuple(rows)
+
+
+def articulate(parts: PosedParts, kinds: Sequence[JointKind] | None = None) -> ArticulatedObject:
+    """The articulated object of posed parts: their joints, and every motion held to its joint's one degree of freedom.
+
+    Arguments as in `joints_of`.
+    """
+    parts = parts.detach()
+    joints = joints_of(parts, kinds)
+    still = SE3.identity(dtype=torch.float64)
+    motions = torch.stack([T.wxyz_xyz for T in (still, *(joint.motion(joint.q[1]) for joint in joints))])
+    return ArticulatedObject(replace(parts, motions=SE3(motions.to(parts.motions.wxyz_xyz))), joints)
+
+
+def _double(motion: SE3) -> SE3:
+    """A motion in float64, its quaternion of unit length to that precision."""
+    motion = motion.to(dtype=torch.float64)
+    return SE3.from_quat(motion.wxyz, motion.xyz)
+
+
+def _joint(moved: _Moved, kind: JointKind) -> Joint:
+    screw, q = screw_of_part(moved.motion, kind, moved.centre)
+    scores = [(min(max(score, 0.0), 1.0), sentence) for score, sentence in _scores(moved, screw)]
+    lowest, sentence = min(scores)
+    (ax, ay, az), (ox, oy, oz) = screw.axis.tolist(), screw.origin.tolist()
+    return Joint(
+        kind,
+        parent=0,
+        axis=(ax, ay, az),
+        origin=(ox, oy, oz),
+        q=(0.0, q),
+        confidence=math.prod(score for score, _ in scores),
+        review=sentence if lowest < _REVIEW_BELOW else "",
+    )
+
+
+def _scores(moved: _Moved, screw: Screw) -> list[tuple[float, str]]:
+    """The scores of `joints_of`, unclipped, each with the sentence that a human reads when it is low."""
+    angle, radius, travel = math.degrees(float(moved.motion.angle)), moved.radius, moved.travel
+    of_type = abs(math.log(max(angle, 1e-6) / PRISMATIC_BELOW_DEG)) / math.log(3)
+    rows = [
+        (of_type, f"The part turns by {angle:.1f} degrees, near the {PRISMATIC_BELOW_DEG:g} that part slides from turns."),
+        (10 * travel / radius, f"The part moves only {travel:.3g} for its size of {2 * radius:.3g}: its axis is uncertain."),
+        (moved.splats / 100, f"Only {moved.splats:.0f} opaque splats show the part: little speaks for its motion."),
+    ]
+    if screw.kind == "revolute":
+        slide = abs(float(screw.axis @ (moved.motion.apply(moved.centre) - moved.centre)))
+        away = float((screw.origin - moved.centre).norm())
+        rows += [
+            (1 - 2 * slide / radius, f"The part also slides {slide:.3g} along the axis that it turns about."),
+            (
+                2 - away / (1.5 * radius),
+                f"The axis runs {away:.3g} away from a part of size {2 * radius:.3g}: is it a slide?",
+            ),
+        ]
+    return rows
