@@ -148,7 +148,7 @@ def test_review_names_the_doubt():
         "near the 5": posed(hinge(6)[1]),
         "moves only": posed(SE3.exp(unit(1, 0, 0, 0, 0, 0) * 0.005)),
         "also slides": posed(SE3.from_quat(turn.wxyz, turn.xyz + 0.2 * screw.axis)),
-        "away from the part": posed(far),
+        "away from a part": posed(far),
         "opaque splats": posed(turn, splats=10),
     }
     for words, parts in doubtful.items():
