@@ -1,7 +1,22 @@
-"""A folder to a `Capture`: two states of posed, masked images, checked."""
+"""A folder to a `Capture`: two states of posed, masked images, checked; and their ground truth, where there is one."""
 
-from .errors import CaptureError
-from .read import load_capture
 from .capture import Capture, View
+from .errors import CaptureError
+from .read import farthest_points, load_capture
+from .truth import TrueJoint, Truth, find_truth, load_truth
+from .write import TrueMesh, save_capture, save_truth
 
-__all__ = ["Capture", "CaptureError", "View", "load_capture"]
+__all__ = [
+    "Capture",
+    "CaptureError",
+    "TrueJoint",
+    "TrueMesh",
+    "Truth",
+    "View",
+    "farthest_points",
+    "find_truth",
+    "load_capture",
+    "load_truth",
+    "save_capture",
+    "save_truth",
+]

@@ -47,6 +47,35 @@ def camera_file(root: Path, layout: Layout, split: Split, state: int) -> Path:
     return root / f"transforms_{split}_{STATES[state]}.json"
 
 
+def truth_folder(root: Path, layout: Layout) -> Path | None:
+    """Where the ground truth of a capture lies, if it has one; None where the PARIS layout's `load` is not in its path."""
+    if layout == "artgs":
+        return root / "gt"
+    parts = root.resolve().parts
+    if "load" not in parts:
+        return None
+    last = len(parts) - 1 - parts[::-1].index("load")
+    return Path(*parts[:last], "data", *parts[last + 1 :])
+
+
+def motion_file(truth: Path) -> Path:
+    """The file of the true joints in a ground truth folder of either layout."""
+    nested = truth / "textured_objs" / "trans.json"
+    return nested if nested.is_file() else truth / "trans.json"
+
+
+def mesh_file(truth: Path, state: int, part: int | None, *, numbered: bool) -> Path:
+    """The mesh of one part in one state: None = the whole object, 0 = what does not move, k = the k-th moving part.
+
+    `numbered`: the files of moving parts carry a number, as they do where there are several.
+    """
+    name = STATES[state]
+    if part is not None:
+        number = f"_{part - 1}" if numbered else ""
+        name += f"_dynamic{number}" if part else "_static"
+    return truth / STATES[state] / f"{name}_rotate.ply"
+
+
 def find_layout(path: Path) -> tuple[Path, Layout]:
     """The capture's own folder and its layout, for that folder or for one above it that holds no other capture.
 

@@ -10,9 +10,9 @@ from jaxtyping import Float, Float64, UInt8
 from PIL import Image
 
 from ..geometry import SE3, Camera
+from .capture import Capture, View
 from .errors import CaptureError
 from .layouts import STATES, Frame, Layout, Split, find_layout, list_frames
-from .capture import Capture, View
 
 FEWEST_VIEWS = 3
 _ROTATION_TOLERANCE = 1e-3  # of R^T R - I; real captures round their poses
