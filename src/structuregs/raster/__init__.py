@@ -1,0 +1,7 @@
+"""Draws splats: a differentiable renderer with several back ends, and the losses on its images."""
+
+from .image_loss import image_loss
+from .records import Projection, Render
+from .render import blend, project, render
+
+__all__ = ["Projection", "Render", "blend", "image_loss", "project", "render"]

@@ -1,0 +1,123 @@
+"""The CPU back end: Numba kernels in float32, held against the reference by tests."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import get_num_threads
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..geometry import Camera
+from ..model import Splats
+from . import blend_kernels as bk
+from . import project_kernels as pk
+from .jit import PARALLEL
+from .records import Projection, Render, frustum_limits, splat_rgb
+
+
+def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"]) -> Render:
+    """See `structuregs.raster.render`; computes in float32, and gives no gradient to the camera's pose."""
+    return blend(project(splats, camera), camera.width, camera.height, background)
+
+
+def project(splats: Splats, camera: Camera) -> Projection:
+    """See `reference.project`."""
+    T_camera_world = camera.T_world_camera.inverse()
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *frustum_limits(camera)], np.float32)
+    view = (_array(T_camera_world.rotation), _array(T_camera_world.xyz), lens, np.array([camera.width, camera.height]))
+    xy, conic, depth, extent, opacity = _Project.apply(
+        splats.means, splats.quats, splats.log_scales, splats.logit_opacities, view
+    )
+    return Projection(xy, conic, depth, extent, splat_rgb(splats, camera).float(), opacity)
+
+
+def blend(projection: Projection, width: int, height: int, background: Float[Tensor, " 3"]) -> Render:
+    """See `reference.blend`."""
+    p = projection
+    rgb, alpha, depth = _Blend.apply(p.xy, p.conic, p.depth, p.rgb, p.opacity, p.extent, background, (height, width))
+    return Render(rgb, alpha, depth, projection)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    """The tensor's values as a contiguous float32 array; shared with the tensor where they already are one."""
+    return tensor.detach().to("cpu", torch.float32).contiguous().numpy()
+
+
+def _or_zeros(gradient: Tensor | None, *shape: int) -> np.ndarray:
+    return np.zeros(shape, np.float32) if gradient is None else _array(gradient)
+
+
+def _tensors(arrays: list[np.ndarray]) -> tuple[Tensor, ...]:
+    return tuple(torch.from_numpy(a) for a in arrays)
+
+
+class _Project(torch.autograd.Function):
+    """Splats to 2D Gaussians."""
+
+    @staticmethod
+    def forward(ctx, means, quats, log_scales, logit_opacities, view):
+        arrays = [_array(t) for t in (means, quats, log_scales, logit_opacities)]
+        n = len(means)
+        outputs = [np.empty(shape, np.float32) for shape in ((n, 2), (n, 3), n, (n, 2), n)]
+        with PARALLEL:
+            pk.project_forward(*arrays, *view, *outputs)
+        xy, conic, depth, extent, opacity = _tensors(outputs)
+        ctx.inputs, ctx.view = arrays[:3], view[:3]
+        ctx.outputs = outputs[4], outputs[1], outputs[3]
+        ctx.dtypes = [t.dtype for t in (means, quats, log_scales, logit_opacities)]
+        ctx.mark_non_differentiable(extent)
+        ctx.set_materialize_grads(False)
+        return xy, conic, depth, extent, opacity
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        g_xy, g_conic, g_depth, _, g_opacity = gradients
+        n = len(ctx.inputs[0])
+        incoming = _or_zeros(g_xy, n, 2), _or_zeros(g_conic, n, 3), _or_zeros(g_depth, n), _or_zeros(g_opacity, n)
+        outgoing = [np.empty(shape, np.float32) for shape in ((n, 3), (n, 4), (n, 3), n)]
+        with PARALLEL:
+            pk.project_backward(*ctx.inputs, *ctx.view, *ctx.outputs, *incoming, *outgoing)
+        return *(t.to(dtype) for t, dtype in zip(_tensors(outgoing), ctx.dtypes, strict=True)), None
+
+
+class _Blend(torch.autograd.Function):
+    """2D Gaussians to an image."""
+
+    @staticmethod
+    def forward(ctx, xy, conic, depth, rgb, opacity, extent, background, size):
+        n, (height, width) = len(xy), size
+        z, reach = _array(depth), _array(extent)
+        rows = np.empty((n, bk.ROW), np.float32)
+        bk.pack(_array(xy), _array(conic), _array(opacity), _array(rgb), z, reach, rows)
+        order = np.argsort(z, kind="stable").astype(np.int32)
+        lists = bk.tile_lists(rows, order[reach[order, 0] > 0], width, height)
+        image, alpha, expected = (np.empty(shape, np.float32) for shape in ((*size, 3), size, size))
+        ends = np.empty(len(lists[0]) - 1, np.int64)
+        with PARALLEL:
+            lanes = get_num_threads()
+            bk.blend_forward(*lists[:2], rows, _array(background), lanes, image, alpha, expected, ends)
+        ctx.state = rows, lists, ends, (image, alpha, expected)
+        ctx.background_needs = ctx.needs_input_grad[6]
+        ctx.set_materialize_grads(False)
+        return _tensors([image, alpha, expected])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        rows, (starts, splats, pair_starts, pairs), ends, drawn = ctx.state
+        size = drawn[1].shape
+        g_image, g_alpha = _or_zeros(gradients[0], *size, 3), _or_zeros(gradients[1], *size)
+        g_depth = None if gradients[2] is None else _array(gradients[2])
+        partials = np.empty((len(pairs), bk.PARTIALS), np.float32)
+        totals = np.empty((len(rows), bk.PARTIALS), np.float32)
+        with PARALLEL:
+            lanes = get_num_threads()
+            bk.blend_backward(starts, splats, rows, ends, lanes, *drawn, g_image, g_alpha, g_depth, partials)
+            bk.sum_partials(pair_starts, pairs, partials, totals)
+        g = torch.from_numpy(totals)
+        g_background = None
+        if ctx.background_needs:
+            through = 1 - torch.from_numpy(drawn[1])
+            g_background = torch.einsum("hwc,hw->c", torch.from_numpy(g_image), through)
+        return g[:, :2], g[:, 2:5], g[:, 9], g[:, 6:9], g[:, 5], None, g_background, None

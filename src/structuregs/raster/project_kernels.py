@@ -1,0 +1,230 @@
+"""The projection of splats onto an image in Numba: values, and gradients written by hand.
+
+Notation as in `reference.project`: with the camera's rotation W and a splat's axes A = W R(q) S, the rows of the
+projected axes are m_x = fx / z (A_x - u A_z) and m_y = fy / z (A_y - v A_z), with u = x / z and v = y / z kept near the
+image; the 2D covariance is [[m_x m_x, m_x m_y], [., m_y m_y]] + dilation.
+"""
+
+import math
+
+import numpy as np
+from numba import prange
+
+from .jit import kernel
+from .records import DILATION, MIN_ALPHA, NEAR
+
+_NEAR, _DILATION, _MIN_ALPHA = np.float32(NEAR), np.float32(DILATION), np.float32(MIN_ALPHA)
+_HUGE = np.float32(1e15)  # larger values, infinity and NaN are not drawn
+_ONE, _TWO, _HALF = np.float32(1), np.float32(2), np.float32(0.5)
+
+
+@kernel()
+def _rotation(w, x, y, z):
+    return (
+        (_ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y)),
+        (_TWO * (x * y + w * z), _ONE - _TWO * (x * x + z * z), _TWO * (y * z - w * x)),
+        (_TWO * (x * z - w * y), _TWO * (y * z + w * x), _ONE - _TWO * (x * x + y * y)),
+    )
+
+
+@kernel()
+def _times(W, R, j):
+    """Column j of the matrix product."""
+    return (
+        W[0, 0] * R[0][j] + W[0, 1] * R[1][j] + W[0, 2] * R[2][j],
+        W[1, 0] * R[0][j] + W[1, 1] * R[1][j] + W[1, 2] * R[2][j],
+        W[2, 0] * R[0][j] + W[2, 1] * R[1][j] + W[2, 2] * R[2][j],
+    )
+
+
+@kernel()
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel()
+def _camera_point(W, t, means, i):
+    p = (means[i, 0], means[i, 1], means[i, 2])
+    return _dot(W[0], p) + t[0], _dot(W[1], p) + t[1], _dot(W[2], p) + t[2]
+
+
+@kernel()
+def _unit_quat(quats, i):
+    """The unit quaternion and one over the length."""
+    w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    inverse = _ONE / max(np.float32(math.sqrt(w * w + x * x + y * y + z * z)), np.float32(1e-12))
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@kernel()
+def _sigmoid(x):
+    return _ONE / (_ONE + np.float32(math.exp(-x)))
+
+
+@kernel()
+def _axes(W, R, scales):
+    """The rows x, y, z of A = W R S."""
+    c0, c1, c2 = _times(W, R, 0), _times(W, R, 1), _times(W, R, 2)
+    s0, s1, s2 = scales
+    return (
+        (c0[0] * s0, c1[0] * s1, c2[0] * s2),
+        (c0[1] * s0, c1[1] * s1, c2[1] * s2),
+        (c0[2] * s0, c1[2] * s1, c2[2] * s2),
+    )
+
+
+@kernel()
+def _image_row(f, a, u, az):
+    return (f * (a[0] - u * az[0]), f * (a[1] - u * az[1]), f * (a[2] - u * az[2]))
+
+
+@kernel()
+def _covariance(m_x, m_y):
+    """(xx, xy, yy, determinant) of the dilated 2D covariance; the determinant as a sum of squares, which cannot cancel."""
+    xx, xy, yy = _dot(m_x, m_x), _dot(m_x, m_y), _dot(m_y, m_y)
+    c0 = m_x[1] * m_y[2] - m_x[2] * m_y[1]
+    c1 = m_x[2] * m_y[0] - m_x[0] * m_y[2]
+    c2 = m_x[0] * m_y[1] - m_x[1] * m_y[0]
+    det = c0 * c0 + c1 * c1 + c2 * c2 + _DILATION * (xx + yy) + _DILATION * _DILATION
+    return xx + _DILATION, xy, yy + _DILATION, det
+
+
+@kernel()
+def _scales(log_scales, i):
+    return (
+        np.float32(math.exp(log_scales[i, 0])),
+        np.float32(math.exp(log_scales[i, 1])),
+        np.float32(math.exp(log_scales[i, 2])),
+    )
+
+
+@kernel(parallel=True)
+def project_forward(means, quats, log_scales, logits, W, t, lens, size, xy, conic, depth, extent, opacity):
+    """Fills the arrays xy (N 2), conic (N 3), depth (N), extent (N 2) and opacity (N) of a `Projection`.
+
+    W (3 3), t (3): world to camera. lens (8): fx, fy, cx, cy and the limits of u and v. size (2): width, height.
+    """
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    for i in prange(len(means)):
+        x, y, z = _camera_point(W, t, means, i)
+        o = _sigmoid(logits[i])
+        opacity[i] = o
+        depth[i] = z
+        xy[i, 0], xy[i, 1] = cx, cy
+        conic[i, 0], conic[i, 1], conic[i, 2] = _ONE, np.float32(0), _ONE
+        extent[i, 0], extent[i, 1] = np.float32(0), np.float32(0)
+        if not (z > _NEAR and z < _HUGE and o >= _MIN_ALPHA):
+            continue
+        w_, x_, y_, z_, _ = _unit_quat(quats, i)
+        a_x, a_y, a_z = _axes(W, _rotation(w_, x_, y_, z_), _scales(log_scales, i))
+        u, v = min(max(x / z, lens[4]), lens[5]), min(max(y / z, lens[6]), lens[7])
+        xx, cross, yy, det = _covariance(_image_row(fx / z, a_x, u, a_z), _image_row(fy / z, a_y, v, a_z))
+        px, py = fx * x / z + cx, fy * y / z + cy
+        if not (abs(px) < _HUGE and abs(py) < _HUGE and xx < _HUGE and yy < _HUGE and det < _HUGE * _HUGE):
+            continue
+        xy[i, 0], xy[i, 1] = px, py
+        conic[i, 0], conic[i, 1], conic[i, 2] = yy / det, -cross / det, xx / det
+        reach = _TWO * np.float32(math.log(o / _MIN_ALPHA))
+        ex, ey = np.float32(math.sqrt(reach * xx)), np.float32(math.sqrt(reach * yy))
+        if px + ex > 0 and px - ex < size[0] and py + ey > 0 and py - ey < size[1]:
+            extent[i, 0], extent[i, 1] = ex, ey
+
+
+@kernel()
+def _quat_gradient(w, x, y, z, c0, c1, c2):
+    """Gradient of a unit quaternion from that of its rotation matrix, given by columns."""
+    return (
+        _TWO * (x * (c1[2] - c2[1]) + y * (c2[0] - c0[2]) + z * (c0[1] - c1[0])),
+        _TWO * (y * (c1[0] + c0[1]) + z * (c2[0] + c0[2]) + w * (c1[2] - c2[1]) - _TWO * x * (c1[1] + c2[2])),
+        _TWO * (x * (c1[0] + c0[1]) + z * (c2[1] + c1[2]) + w * (c2[0] - c0[2]) - _TWO * y * (c0[0] + c2[2])),
+        _TWO * (x * (c2[0] + c0[2]) + y * (c2[1] + c1[2]) + w * (c0[1] - c1[0]) - _TWO * z * (c0[0] + c1[1])),
+    )
+
+
+@kernel()
+def _inverse_gradient(conic, g_conic, i):
+    """Gradient of (xx, xy, yy) of the covariance from that of its inverse K: -K G K, G with half of xy on each side."""
+    A, B, C = conic[i, 0], conic[i, 1], conic[i, 2]
+    gA, gB, gC = g_conic[i, 0], _HALF * g_conic[i, 1], g_conic[i, 2]
+    p, q, r, s = gA * A + gB * B, gA * B + gB * C, gB * A + gC * B, gB * B + gC * C
+    return -(A * p + B * r), -_TWO * (A * q + B * s), -(B * q + C * s)
+
+
+@kernel()
+def _world_column(W, g_x, g_y, g_z):
+    """W^T g."""
+    return (
+        W[0, 0] * g_x + W[1, 0] * g_y + W[2, 0] * g_z,
+        W[0, 1] * g_x + W[1, 1] * g_y + W[2, 1] * g_z,
+        W[0, 2] * g_x + W[1, 2] * g_y + W[2, 2] * g_z,
+    )
+
+
+@kernel()
+def _axis_gradient(W, j, f_x, f_y, u, v, m_x, m_y, g_cov):
+    """Gradient of axis j in the world (a column of R S) from that of the covariance."""
+    g_x = f_x * (_TWO * g_cov[0] * m_x[j] + g_cov[1] * m_y[j])
+    g_y = f_y * (_TWO * g_cov[2] * m_y[j] + g_cov[1] * m_x[j])
+    return _world_column(W, g_x, g_y, -(u * g_x + v * g_y))
+
+
+@kernel()
+def _scaled(a, s):
+    return (a[0] * s, a[1] * s, a[2] * s)
+
+
+@kernel()
+def _centre_gradient(p, lens, m_x, m_y, a_z, g_cov, g_x, g_y, g_depth):
+    """Gradient of the centre in the camera's frame; g_x, g_y: of the centre on the image."""
+    x, y, z = p
+    f_x, f_y = lens[0] / z, lens[1] / z
+    d_x, d_y = g_x * f_x, g_y * f_y
+    d_z = g_depth - (d_x * x + d_y * y) / z
+    # Both image rows go with 1 / z; u and v follow the centre only inside the limits.
+    xx, cross, yy = _dot(m_x, m_x), _dot(m_x, m_y), _dot(m_y, m_y)
+    d_z -= _TWO * (g_cov[0] * xx + g_cov[1] * cross + g_cov[2] * yy) / z
+    if lens[4] <= x / z <= lens[5]:
+        g_u = -f_x * (_TWO * g_cov[0] * _dot(m_x, a_z) + g_cov[1] * _dot(m_y, a_z))
+        d_x += g_u / z
+        d_z -= g_u * x / (z * z)
+    if lens[6] <= y / z <= lens[7]:
+        g_v = -f_y * (_TWO * g_cov[2] * _dot(m_y, a_z) + g_cov[1] * _dot(m_x, a_z))
+        d_y += g_v / z
+        d_z -= g_v * y / (z * z)
+    return d_x, d_y, d_z
+
+
+@kernel(parallel=True)
+def project_backward(
+    means, quats, log_scales, W, t, lens, opacity, conic, extent, g_xy, g_conic, g_depth, g_opacity,
+    d_means, d_quats, d_log_scales, d_logits,
+):  # fmt: skip
+    """Fills the gradients d_* of the splats' tensors from the gradients g_* of the projection; 0 for splats not drawn."""
+    for i in prange(len(means)):
+        d_logits[i] = g_opacity[i] * opacity[i] * (_ONE - opacity[i])
+        if not extent[i, 0] > 0:
+            d_means[i, :], d_quats[i, :], d_log_scales[i, :] = np.float32(0), np.float32(0), np.float32(0)
+            continue
+        p = _camera_point(W, t, means, i)
+        qw, qx, qy, qz, inverse = _unit_quat(quats, i)
+        R, s = _rotation(qw, qx, qy, qz), _scales(log_scales, i)
+        a_x, a_y, a_z = _axes(W, R, s)
+        u, v = min(max(p[0] / p[2], lens[4]), lens[5]), min(max(p[1] / p[2], lens[6]), lens[7])
+        f_x, f_y = lens[0] / p[2], lens[1] / p[2]
+        m_x, m_y = _image_row(f_x, a_x, u, a_z), _image_row(f_y, a_y, v, a_z)
+        g_cov = _inverse_gradient(conic, g_conic, i)
+
+        d = _centre_gradient(p, lens, m_x, m_y, a_z, g_cov, g_xy[i, 0], g_xy[i, 1], g_depth[i])
+        d_means[i, 0], d_means[i, 1], d_means[i, 2] = _world_column(W, d[0], d[1], d[2])
+
+        c0 = _scaled(_axis_gradient(W, 0, f_x, f_y, u, v, m_x, m_y, g_cov), s[0])
+        c1 = _scaled(_axis_gradient(W, 1, f_x, f_y, u, v, m_x, m_y, g_cov), s[1])
+        c2 = _scaled(_axis_gradient(W, 2, f_x, f_y, u, v, m_x, m_y, g_cov), s[2])
+        d_log_scales[i, 0] = c0[0] * R[0][0] + c0[1] * R[1][0] + c0[2] * R[2][0]
+        d_log_scales[i, 1] = c1[0] * R[0][1] + c1[1] * R[1][1] + c1[2] * R[2][1]
+        d_log_scales[i, 2] = c2[0] * R[0][2] + c2[1] * R[1][2] + c2[2] * R[2][2]
+
+        g = _quat_gradient(qw, qx, qy, qz, c0, c1, c2)
+        along = g[0] * qw + g[1] * qx + g[2] * qy + g[3] * qz
+        d_quats[i, 0], d_quats[i, 1] = (g[0] - along * qw) * inverse, (g[1] - along * qx) * inverse
+        d_quats[i, 2], d_quats[i, 3] = (g[2] - along * qy) * inverse, (g[3] - along * qz) * inverse

@@ -1,0 +1,54 @@
+"""The renderer's door: picks the back end."""
+
+import importlib
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..geometry import Camera
+from ..model import Splats
+from .records import Projection, Render
+
+Backend = Literal["auto", "reference", "cpu", "cuda"]
+
+
+def _module(name: str):
+    return importlib.import_module(f".{name}", __package__)
+
+
+def render(
+    splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"] | None = None, backend: Backend = "auto"
+) -> Render:
+    """Draws splats, which are in the world, as the camera sees them; differentiable in the splats and the background.
+
+    Args:
+        splats: in the world's frame.
+        camera: where from, and the size of the image.
+        background: rgb behind everything; white by default.
+        backend: "reference" is plain torch (any device and type, slow, differentiable in the camera's pose too), "cpu"
+            is Numba (float32), "cuda" is gsplat; "auto" takes the fast one of the splats' device.
+
+    Raises:
+        RuntimeError: the cuda back end cannot run here.
+    """
+    if background is None:
+        background = splats.means.new_ones(3)
+    if backend == "auto":
+        backend = "cuda" if splats.means.is_cuda else "cpu"
+    return _module(backend).render(splats, camera, background=background)
+
+
+def _stages(tensor: Tensor):
+    return _module("cpu" if tensor.device.type == "cpu" and tensor.dtype == torch.float32 else "reference")
+
+
+def project(splats: Splats, camera: Camera) -> Projection:
+    """The first stage of `render`: splats in the world to 2D Gaussians on the image."""
+    return _stages(splats.means).project(splats, camera)
+
+
+def blend(projection: Projection, width: int, height: int, background: Float[Tensor, " 3"]) -> Render:
+    """The second stage of `render`: 2D Gaussians to an image, blended from near to far."""
+    return _stages(projection.xy).blend(projection, width, height, background)
