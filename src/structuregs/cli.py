@@ -1,0 +1,262 @@
+"""The command line: `structuregs fit | eval | render | demo`."""
+
+import math
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from .capture import TrueJoint
+    from .evaluate import JointScore, Report
+    from .fit import Finished, FitEvent, Step
+    from .model import ArticulatedObject
+
+# Packages that cost a second or more to import are imported in the commands: `--help` must not wait for them.
+
+CaptureFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")]
+RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+NewRun = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="RUN")]
+Picture = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
+
+
+def fit(
+    capture: CaptureFolder,
+    run: NewRun,
+    preset: Literal["fast", "default", "paper"] = "default",
+    views: int | None = None,
+    parts: int | None = None,
+    seed: int = 0,
+    points: str = "hull",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+) -> None:
+    """Reconstruct the object of a capture; on an existing run, go on from its last checkpoint.
+
+    Args:
+        capture: Folder of the capture, in the PARIS or the ArtGS layout.
+        run: Folder of the run.
+        preset: fast: a look in about a minute. default: accurate. paper: the paper's iterations and rates.
+        views: Use this many views of each state, spread over the cameras. Default: all.
+        parts: Number of moving parts. Default: estimated.
+        seed: The same seed gives the same bytes on a CPU.
+        points: Where the first points come from: hull (masks), depth (the capture's depth maps), or a file.
+        device: Where to compute.
+    """
+    _fit(capture, run, preset=preset, views=views, parts=parts, seed=seed, points=points, device=device)
+
+
+def evaluate(
+    run: RunFolder,
+    truth: Path | None = None,
+    protocol: Literal["paris", "artgs", "strict"] = "strict",
+    json: Path | None = None,
+) -> None:
+    """Compare a run with ground truth and with the held-out views of its capture.
+
+    Args:
+        run: Folder of the run.
+        truth: Folder of the ground truth. Default: where the capture's layout keeps it.
+        protocol: paris, artgs: as those benchmarks print their figures. strict: also PSNR over the object's own pixels.
+        json: Write the figures to this file too; distances are in the capture's unit under every protocol.
+    """
+    from .evaluate import evaluate_run, write_report
+
+    report = evaluate_run(run, truth=truth, protocol=protocol)
+    if json is not None:
+        write_report(report, json)
+    _print_report(report)
+
+
+def render(run: RunFolder, output: Picture, size: int = 480, frames: int = 48, view: str | None = None) -> None:
+    """Draw the joints of a run swept there and back.
+
+    Args:
+        run: Folder of the run.
+        output: .webp or .gif: an animation. .png: state 0, half way and state 1. A folder: a PNG for each frame.
+        size: Longer side of the pictures, pixels.
+        frames: Frames of the whole way.
+        view: Name of a view of state 1 to look from. Default: the one that shows most of the motion.
+    """
+    from .capture import load_capture
+    from .evaluate import capture_of_run
+    from .export import telling_order, write_sweep
+    from .model import load_object
+
+    obj = load_object(run / "object")
+    cameras = {row.name: row.camera for row in load_capture(capture_of_run(run)).train[1]}
+    if view is not None and view not in cameras:
+        raise ValueError(
+            f"--view {view}: the capture has no such view in state 1; they run from {min(cameras)} to {max(cameras)}."
+        )
+    names = list(cameras)
+    camera = cameras[view if view is not None else names[telling_order(obj, list(cameras.values()))[0]]]
+    scale = size / max(camera.width, camera.height)
+    camera = camera.resized(round(camera.width * scale), round(camera.height * scale))
+    files = write_sweep(obj, camera, output, frames=frames)
+    print(f"wrote {output}" + (f" ({len(files)} pictures)" if len(files) > 1 else ""))
+
+
+def demo(run: NewRun = Path("runs/demo")) -> None:
+    """Make a small capture of a known object on the spot, reconstruct it, and print its joints beside the truth.
+
+    Args:
+        run: Folder of the run; the capture is made in its `capture` folder.
+    """
+    from .capture import find_truth, load_capture, load_truth
+    from .evaluate import evaluate_run
+    from .synthetic import write_demo_capture
+
+    folder = run / "capture"
+    if not folder.exists():
+        print(f"making a capture of a cabinet with a door and a drawer in {folder}")
+        write_demo_capture(folder)
+    obj = _fit(folder, run, preset="fast")
+    truth = find_truth(load_capture(folder, views=3))
+    assert truth is not None, "the demo's capture is written with its truth"
+    report = evaluate_run(run)
+    _print_truth(obj, load_truth(truth).joints, report)
+
+
+def _fit(
+    capture: Path,
+    run: Path,
+    *,
+    preset: Literal["fast", "default", "paper"],
+    views: int | None = None,
+    parts: int | None = None,
+    seed: int = 0,
+    points: str = "hull",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+) -> "ArticulatedObject":
+    from .capture import load_capture
+    from .export import write_structure
+    from .fit.reconstruct import PRESETS, fit_run
+
+    photos = load_capture(capture, views=views, seed=seed)
+    events = fit_run(photos, run, PRESETS[preset], device=device, parts=parts, points=points, seed=seed)
+    obj = _follow(events).obj
+    write_structure(photos, obj, run / "overview.png")
+    _print_joints(obj)
+    print(f"wrote {run}; look at {run / 'overview.png'}")
+    return obj
+
+
+def _follow(events: "Iterable[FitEvent]") -> "Finished":
+    """Shows a fit's events as progress bars and lines until it is finished."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from .fit import Finished, Note, StageStarted, Step
+
+    columns = ("{task.description:12}", BarColumn(), MofNCompleteColumn(), "{task.fields[figures]}", TimeRemainingColumn())
+    with Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns)) as progress:
+        task = None
+        for event in events:
+            match event:
+                case StageStarted(stage, steps):
+                    task = progress.add_task(stage, total=steps, figures="")
+                case Step(step=step) if task is not None:
+                    progress.update(task, completed=step, figures=_figures(event))
+                case Note(text):
+                    progress.console.print(text)
+                case Finished():
+                    return event
+    raise RuntimeError("the fit ended without a result; run the same command to go on.")
+
+
+def _figures(step: "Step") -> str:
+    psnr = "" if step.psnr is None else f"  PSNR {step.psnr:.1f}"
+    return f"loss {step.loss:.4f}{psnr}  {step.splats} splats"
+
+
+def _print_joints(obj: "ArticulatedObject") -> None:
+    """One row for each joint, and a line for each that a human should look at."""
+    _print_table(
+        ("part", "type", "axis", "origin", "moved by", "confidence"),
+        [
+            (str(k), j.kind, _vector(j.axis), _vector(j.origin), _amount(j.kind, j.q[1]), f"{j.confidence:.2f}")
+            for k, j in enumerate(obj.joints, start=1)
+        ],
+    )
+    for k, joint in enumerate(obj.joints, start=1):
+        if joint.review:
+            print(f"part {k}, please look: {joint.review}")
+
+
+def _print_report(report: "Report") -> None:
+    """The table of a report, in its protocol's units."""
+    from .evaluate import PROTOCOLS
+
+    unit = PROTOCOLS[report.protocol].printed_unit
+    position = "axis position" if unit == 1 else f"axis position ({unit:g} units)"
+    heads = ("part", "type", "true type", "axis (deg)", position, "geodesic (deg)", "translation")
+    if report.joints:
+        _print_table(heads, [_score_row(score, unit) for score in report.joints])
+        print(f"{report.failures} of {len(report.joints)} joints failed; distances are in the capture's unit unless marked")
+    else:
+        print("no ground truth beside the capture, so no joints are compared; give it with --truth")
+    for k in report.unmatched_parts:
+        print(f"part {k} stands for no true joint")
+    if report.psnr is not None:
+        states = ", ".join("-" if p is None else f"{p:.2f}" for p in report.psnr_by_state)
+        inside = "" if report.psnr_object is None else f"; object's own pixels {report.psnr_object:.2f}"
+        print(f"PSNR of held-out views {report.psnr:.2f} dB (states 0, 1: {states}{inside})")
+    if report.seconds is not None:
+        print(f"fitted in {report.seconds:.0f} s")
+
+
+def _score_row(score: "JointScore", unit: float) -> tuple[str, ...]:
+    errors = (score.axis_angle_deg, score.axis_position, score.geodesic_deg, score.translation)
+    scales = (1.0, unit, 1.0, 1.0)
+    shown = ("F" if score.failed else "-" if e is None else f"{e / s:.4f}" for e, s in zip(errors, scales, strict=True))
+    return ("-" if score.part is None else str(score.part), score.kind or "-", score.kind_true, *shown)
+
+
+def _print_truth(obj: "ArticulatedObject", truth: "Iterable[TrueJoint]", report: "Report") -> None:
+    """What was found, row by row beside what is true."""
+    rows = []
+    for true, score in zip(truth, report.joints, strict=True):
+        if score.part is not None:
+            joint = obj.joints[score.part - 1]
+            rows.append((f"part {score.part}", joint.kind, _vector(joint.axis), _amount(joint.kind, joint.q[1])))
+        rows.append(("truth", true.kind, _vector(true.axis), _amount(true.kind, true.q1 - true.q0)))
+    _print_table(("", "type", "axis", "moved by"), rows)
+    _print_report(report)
+
+
+def _print_table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*heads)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def _vector(values: tuple[float, float, float]) -> str:
+    return " ".join(f"{v:+.3f}" for v in values)
+
+
+def _amount(kind: str, q: float) -> str:
+    return f"{math.degrees(q):.2f} deg" if kind == "revolute" else f"{q:.4f} units"
+
+
+def main() -> None:
+    """Runs the command line; a user's error is one sentence and exit code 2 (`STRUCTUREGS_DEBUG=1` shows the traceback)."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            {"fit": fit, "eval": evaluate, "render": render, "demo": demo},
+            prog="structuregs",
+            description="Photos of an articulated object in two states go in; a working digital twin comes out.",
+        )
+    except KeyboardInterrupt:
+        print("interrupted; run the same command to go on", file=sys.stderr)
+        sys.exit(130)
+    except (ValueError, RuntimeError, OSError) as error:
+        if os.environ.get("STRUCTUREGS_DEBUG"):
+            raise
+        print("structuregs: " + " ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2)
