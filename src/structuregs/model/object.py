@@ -1,13 +1,14 @@
 """The articulated object: what a run ends in, and its file format."""
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 from ..geometry import SE3, Box
 from .joint import Joint
@@ -72,10 +73,10 @@ def save_object(obj: ArticulatedObject, folder: Path) -> None:
     }
     staged = folder / "splats.safetensors.part"
     save_file(tensors, staged)
-    os.replace(staged, folder / "splats.safetensors")
+    staged.replace(folder / "splats.safetensors")
     staged = folder / "object.json.part"
     staged.write_text(json.dumps(record, indent=1) + "\n")
-    os.replace(staged, folder / "object.json")
+    staged.replace(folder / "object.json")
 
 
 def load_object(folder: Path) -> ArticulatedObject:
@@ -84,22 +85,33 @@ def load_object(folder: Path) -> ArticulatedObject:
     Raises:
         ValueError: a file is missing, damaged or of another version.
     """
+    for name in ("object.json", "splats.safetensors"):
+        if not (folder / name).is_file():
+            raise ValueError(f"{folder}: no object here ({name} is missing); run `structuregs fit` first.")
     try:
         record = json.loads((folder / "object.json").read_text())
         tensors = load_file(folder / "splats.safetensors")
-    except FileNotFoundError as error:
-        raise ValueError(f"{folder}: no object here ({Path(error.filename).name} is missing); run `structuregs fit` first.") from error
-    except (json.JSONDecodeError, SafetensorError) as error:
+    except (ValueError, SafetensorError) as error:
         raise ValueError(f"{folder}: the object's files are damaged ({error}); fit it again.") from error
-    if record.get("format") != FORMAT or record.get("version") != VERSION:
-        found = f"{record.get('format')} {record.get('version')}"
+    if not isinstance(record, dict) or (record.get("format"), record.get("version")) != (FORMAT, VERSION):
+        found = f"{record.get('format')} {record.get('version')}" if isinstance(record, dict) else type(record).__name__
         raise ValueError(f"{folder}/object.json: format {found}, but this version reads {FORMAT} {VERSION}.")
+    try:
+        return _object(record, tensors)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{folder}/object.json: the object's files are damaged ({error!r}); fit it again.") from error
+
+
+def _object(record: dict[str, Any], tensors: dict[str, Tensor]) -> ArticulatedObject:
+    """The object of a file's record and tensors; errors are those of reading them."""
     rows = record["parts"]
-    boxes = Box(
-        SE3(torch.tensor([row["box"]["wxyz_xyz"] for row in rows])), torch.tensor([row["box"]["half_extents"] for row in rows])
-    )
+    poses = SE3(torch.tensor([row["box"]["wxyz_xyz"] for row in rows]))
+    boxes = Box(poses, torch.tensor([row["box"]["half_extents"] for row in rows]))
     motions = SE3(torch.tensor([row["motion_wxyz_xyz"] for row in rows]))
+    counts = tuple(row["splats"] for row in rows)
     tint = tensors.pop("tint")
-    parts = PosedParts(boxes, motions, Splats(**tensors), tuple(row["splats"] for row in rows), tint)
+    splats = Splats(**tensors)
+    if sum(counts) != len(splats) or len(record["joints"]) != len(rows) - 1:
+        raise ValueError("its parts, joints and splats do not add up")
     joints = [row | {key: tuple(row[key]) for key in ("axis", "origin", "q")} for row in record["joints"]]
-    return ArticulatedObject(parts, tuple(Joint(**row) for row in joints))
+    return ArticulatedObject(PosedParts(boxes, motions, splats, counts, tint), tuple(Joint(**row) for row in joints))
