@@ -2,13 +2,17 @@
 
 from .capture import Capture, View
 from .errors import CaptureError
+from .layouts import Layout
 from .read import farthest_points, load_capture
+from .stack import ImageStack, stack_views
 from .truth import TrueJoint, Truth, find_truth, load_truth
 from .write import TrueMesh, save_capture, save_truth
 
 __all__ = [
     "Capture",
     "CaptureError",
+    "ImageStack",
+    "Layout",
     "TrueJoint",
     "TrueMesh",
     "Truth",
@@ -19,4 +23,5 @@ __all__ = [
     "load_truth",
     "save_capture",
     "save_truth",
+    "stack_views",
 ]
