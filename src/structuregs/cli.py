@@ -12,7 +12,7 @@ import tyro
 if TYPE_CHECKING:
     from .capture import TrueJoint
     from .evaluate import JointScore, Report
-    from .fit import Finished, FitEvent, Step
+    from .fit.events import Finished, FitEvent, Step
     from .model import ArticulatedObject
 
 # Packages that cost a second or more to import are imported in the commands: `--help` must not wait for them.
@@ -105,19 +105,26 @@ def demo(run: NewRun = Path("runs/demo")) -> None:
     Args:
         run: Folder of the run; the capture is made in its `capture` folder.
     """
-    from .capture import find_truth, load_capture, load_truth
+    from .capture import load_truth
     from .evaluate import evaluate_run
-    from .synthetic import write_demo_capture
 
-    folder = run / "capture"
-    if not folder.exists():
-        print(f"making a capture of a cabinet with a door and a drawer in {folder}")
-        write_demo_capture(folder)
-    obj = _fit(folder, run, preset="fast")
-    truth = find_truth(load_capture(folder, views=3))
-    assert truth is not None, "the demo's capture is written with its truth"
-    report = evaluate_run(run)
-    _print_truth(obj, load_truth(truth).joints, report)
+    capture = run / "capture"
+    truth = _make_known(capture)
+    obj = _fit(capture, run, preset="fast")
+    _print_truth(obj, load_truth(truth).joints, evaluate_run(run, truth=truth))
+
+
+def _make_known(capture: Path) -> Path:
+    """Makes the demo's capture where it is not there yet, aside and then into place; the folder of its truth."""
+    from .synthetic import make_capture, make_object, save_known
+
+    if not capture.exists():
+        print(f"making a capture of a cabinet with a door and a drawer in {capture}")
+        cabinet = make_object("cabinet")
+        staged = capture.with_name("capture.part")
+        save_known(cabinet, make_capture(cabinet), staged, "artgs")
+        staged.replace(capture)
+    return capture / "gt"
 
 
 def _fit(
@@ -148,7 +155,7 @@ def _follow(events: "Iterable[FitEvent]") -> "Finished":
     """Shows a fit's events as progress bars and lines until it is finished."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from .fit import Finished, Note, StageStarted, Step
+    from .fit.events import Finished, Note, StageStarted, Step
 
     columns = ("{task.description:12}", BarColumn(), MofNCompleteColumn(), "{task.fields[figures]}", TimeRemainingColumn())
     with Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns)) as progress:
@@ -190,11 +197,11 @@ def _print_report(report: "Report") -> None:
     from .evaluate import PROTOCOLS
 
     unit = PROTOCOLS[report.protocol].printed_unit
-    position = "axis position" if unit == 1 else f"axis position ({unit:g} units)"
-    heads = ("part", "type", "true type", "axis (deg)", position, "geodesic (deg)", "translation")
+    position = "position" if unit == 1 else f"position ({unit:g} units)"
+    heads = ("part", "type", "truth", "axis", position, "geodesic", "translation")
     if report.joints:
         _print_table(heads, [_score_row(score, unit) for score in report.joints])
-        print(f"{report.failures} of {len(report.joints)} joints failed; distances are in the capture's unit unless marked")
+        print(f"{report.failures} of {len(report.joints)} joints failed; degrees, and the capture's unit unless marked")
     else:
         print("no ground truth beside the capture, so no joints are compared; give it with --truth")
     for k in report.unmatched_parts:

@@ -1,5 +1,4 @@
-"""From a capture to an articulated object: the stages, their losses, and the events that they yield."""
+"""From a capture to an articulated object: the stages, their losses, and the events that they yield.
 
-from .events import Finished, FitEvent, Note, StageStarted, Step
-
-__all__ = ["Finished", "FitEvent", "Note", "StageStarted", "Step"]
+Nothing is imported here: the command line reads the presets from `schedule`, and must not wait for torch.
+"""
