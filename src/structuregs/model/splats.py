@@ -1,11 +1,14 @@
 """3D Gaussian splats in one frame."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from ..geometry import SE3, quat_multiply
+from .sh import rotate_sh
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 
@@ -50,6 +53,11 @@ class Splats:
     def tensors(self) -> dict[str, Tensor]:
         """Its tensors by name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def moved(self, T: SE3) -> "Splats":
+        """The same splats after a rigid motion."""
+        T = T.to(dtype=self.means.dtype)
+        return replace(self, means=T.apply(self.means), quats=quat_multiply(T.wxyz, self.quats), sh=rotate_sh(self.sh, T.rotation))
 
     def __getitem__(self, index: slice | Tensor) -> "Splats":
         """The splats that an index, a mask or a slice selects."""

@@ -1,0 +1,1 @@
+"""Clouds to boxes matched across states, with hypotheses for their motions."""

@@ -1,0 +1,93 @@
+"""The motion cue, read both ways, and the clusters of what moved (supplement 1.3, method.md point 3)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float64
+from scipy.spatial import cKDTree
+from sklearn.cluster import DBSCAN
+
+from ..geometry import Box
+from ..points import Hull
+
+
+@dataclass(frozen=True)
+class CueConfig:
+    """How moving points are told from still ones, in voxels of the hull."""
+
+    threshold: float = 1.5
+    """A point moves if it lies further than this from the other state's solid (tau_motion)."""
+    link: float = 2.5
+    """Moving points closer than this belong together (DBSCAN's eps)."""
+    neighbours: int = 6
+    """Points within `link` that make a point dense (DBSCAN's min_samples)."""
+    smallest: float = 0.004
+    """Clusters below this fraction of a state's points are dropped as noise."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Points that are in one state and not in the other: a moving part, several, or a piece of one.
+
+    Attributes:
+        state: the state in which the points are there.
+        points: in the world.
+    """
+
+    state: int
+    points: Float64[np.ndarray, "P 3"]
+
+
+def moving_points(
+    points: Float64[np.ndarray, "P 3"], other: Hull, other_points: Float64[np.ndarray, "Q 3"], threshold: float
+) -> Bool[np.ndarray, " P"]:
+    """Points farther than `threshold` (world units) from anything that the other state may hold there.
+
+    That is eq. 1 of the supplement against the other state's points, and against its solid hull, so that a surface which
+    merely came to light (the inside of an open drawer's cabinet) is no motion.
+    """
+    solid = other.sample(other.distance(), points, outside=np.inf)
+    nearest = cKDTree(other_points).query(points, distance_upper_bound=2 * threshold)[0] if len(other_points) else solid
+    return (solid > threshold) & (nearest > threshold)
+
+
+def clusters(
+    points: tuple[Float64[np.ndarray, "P 3"], Float64[np.ndarray, "Q 3"]], hulls: tuple[Hull, Hull], config: CueConfig
+) -> list[Cluster]:
+    """Clusters of departed (state 0) and arrived (state 1) points, the largest first."""
+    found = []
+    for state in (0, 1):
+        other = 1 - state
+        voxel = hulls[other].voxel
+        moving = points[state][moving_points(points[state], hulls[other], points[other], config.threshold * voxel)]
+        if len(moving) < config.neighbours:
+            continue
+        labels = DBSCAN(eps=config.link * voxel, min_samples=config.neighbours).fit_predict(moving)
+        for label in range(labels.max() + 1):
+            members = moving[labels == label]
+            if len(members) >= max(config.smallest * len(points[state]), 2 * config.neighbours):
+                found.append(Cluster(state, members))
+    return sorted(found, key=lambda cluster: -len(cluster.points))
+
+
+def box_around(points: Float64[np.ndarray, "P 3"], thinnest: float, trim: float = 0.002) -> Box:
+    """The oriented box of least volume around points, the outermost fraction `trim` left out along each axis.
+
+    Args:
+        points: in the world.
+        thinnest: smallest half extent to give, world units (points on a plane have no thickness).
+        trim: fraction of the points that may stick out at each face.
+    """
+    try:
+        to_box = trimesh.bounds.oriented_bounds(points)[0]
+        axes = torch.from_numpy(to_box[:3, :3].T.copy())
+    except (ValueError, IndexError, RuntimeError):  # fewer than four points, or all in one plane
+        axes = torch.from_numpy(np.linalg.svd(points - points.mean(0), full_matrices=True)[2].T.copy())
+    if torch.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    local = points @ axes.numpy()
+    low, high = np.quantile(local, [trim, 1 - trim], axis=0)
+    box = Box.around(torch.from_numpy(np.stack([low, high]) @ axes.numpy().T), axes)
+    return Box(box.T_world_box, box.half_extents.clamp(min=thinnest))

@@ -1,0 +1,131 @@
+"""Motion hypotheses: where could a moving cluster be in the other state, and which of these do masks and images allow?
+
+Hinges turn about a box's own edges and slides run along its axes (method.md, points 3 and 4), so that a few hundred rigid
+motions hold one close to the truth.  The other state's hull rules most of them out at once; rendering the rest into the
+other state's photos, and then letting the images pull at the best of them, decides.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from ..geometry import SE3, Box, Screw
+from ..points import Hull
+
+_ANGLES = torch.deg2rad(torch.tensor([8.0, *range(15, 181, 15)], dtype=torch.float64))
+_LENGTHS = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.75, 2.0], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One rigid motion that a cluster may make, from its own state to the other, and what speaks against it.
+
+    Attributes:
+        motion: of the world, float64.
+        outside: mean depth by which the moved points leave the other state's solid, in voxels.
+        unexplained: fraction of the other state's moving points near the motion's reach that it leaves uncovered.
+        image_error: mean absolute error of the other state's photos with the part moved so; infinite until looked at.
+    """
+
+    motion: SE3
+    outside: float
+    unexplained: float
+    image_error: float = float("inf")
+
+
+def hinge_screws(box: Box) -> list[Screw]:
+    """Turns about lines along the box's axes: its edges, the mid-lines of its faces and of itself."""
+    screws = []
+    R, centre, h = box.T_world_box.rotation, box.T_world_box.xyz, box.half_extents
+    for axis in range(3):
+        b, c = (axis + 1) % 3, (axis + 2) % 3
+        for i, j in itertools.product((-1, 0, 1), repeat=2):
+            screws.append(Screw("revolute", R[:, axis], centre + R[:, b] * h[b] * i + R[:, c] * h[c] * j))
+    return screws
+
+
+def slide_screws(box: Box, base: Box) -> list[Screw]:
+    """Slides along the axes of the box, and along those of the base that differ from them."""
+    axes = list(box.T_world_box.rotation.T)
+    for axis in base.T_world_box.rotation.T:
+        if max(abs(float(axis @ other)) for other in axes) < np.cos(np.deg2rad(4)):
+            axes.append(axis)
+    return [Screw("prismatic", axis, box.T_world_box.xyz) for axis in axes]
+
+
+def registrations(box: Box, target: Box) -> list[SE3]:
+    """Motions that lay the box upon another, in each of the 24 ways that a box can be turned."""
+    motions = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            flip = torch.zeros(3, 3, dtype=torch.float64)
+            for column, (row, sign) in enumerate(zip(order, signs, strict=True)):
+                flip[row, column] = sign
+            if torch.linalg.det(flip) > 0:
+                turned = SE3.from_rotation(target.T_world_box.rotation @ flip, target.T_world_box.xyz)
+                motions.append(turned @ box.T_world_box.inverse())
+    return motions
+
+
+def candidate_motions(box: Box, base: Box, targets: list[Box]) -> SE3:
+    """All motions worth a look for a cluster's box: M rigid motions of the world, float64."""
+    rows = [SE3.identity(dtype=torch.float64).wxyz_xyz]
+    for screw in hinge_screws(box):
+        rows += [screw.motion(sign * angle).wxyz_xyz for angle in _ANGLES for sign in (1, -1)]
+    reach = float(box.half_extents.max())
+    for screw in slide_screws(box, base):
+        along = box.T_world_box.rotation.T @ screw.axis
+        size = max(float((along.abs() * 2 * box.half_extents).sum()), 0.2 * reach)
+        rows += [screw.motion(sign * length * size).wxyz_xyz for length in _LENGTHS for sign in (1, -1)]
+    for target in targets:
+        rows += [motion.wxyz_xyz for motion in registrations(box, target)]
+    return SE3(torch.stack(rows))
+
+
+def hull_scores(
+    motions: SE3, points: Float64[np.ndarray, "P 3"], other: Hull, arrivals: Float64[np.ndarray, "Q 3"], box: Box
+) -> tuple[Float64[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
+    """`outside` and `unexplained` of each motion (see `Hypothesis`).
+
+    Args:
+        motions: M motions from the cluster's state to the other.
+        points: the cluster's points.
+        other: the other state's hull.
+        arrivals: points of the other state that this cluster might account for; may be none.
+        box: the cluster's box.
+    """
+    field = np.minimum(other.distance() / other.voxel, 4.0)
+    moved = motions[:, None].apply(torch.from_numpy(points)).numpy()
+    outside = other.sample(field, moved.reshape(-1, 3), outside=4.0).reshape(len(moved), -1)
+    outside = np.maximum(outside - 1.0, 0.0).mean(1)
+    if not len(arrivals):
+        return outside, np.zeros(len(outside))
+    back = motions.inverse()[:, None].apply(torch.from_numpy(arrivals))
+    return outside, 1 - box.contains(back, margin=2 * other.voxel).double().mean(1).numpy()
+
+
+def displacement(a: SE3, b: SE3, box: Box) -> float:
+    """Root mean square distance between a box's corners moved by two motions, relative to its half diagonal."""
+    gap = a.apply(box.corners) - b.apply(box.corners)
+    return float(gap.square().sum(-1).mean().sqrt() / box.half_extents.norm())
+
+
+def distinct(hypotheses: list[Hypothesis], box: Box, gap: float, most: int) -> list[Hypothesis]:
+    """The first `most` hypotheses, in the order given, of which no two are closer than `gap` (see `displacement`)."""
+    kept: list[Hypothesis] = []
+    for hypothesis in hypotheses:
+        if all(displacement(hypothesis.motion, other.motion, box) > gap for other in kept):
+            kept.append(hypothesis)
+            if len(kept) == most:
+                break
+    return kept
+
+
+def turn_about(centre: Float[Tensor, " 3"], tangent: Float[Tensor, " 6"]) -> SE3:
+    """The motion `exp(tangent)` seen from `centre`: a small rotation there does not drag the part away."""
+    turn = SE3.exp(tangent)
+    return SE3.from_quat(turn.wxyz, turn.xyz + centre - turn.rotation @ centre)

@@ -1,0 +1,120 @@
+"""What a fit does when: the configuration and its presets.  Imports no torch, so that `--help` is quick."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+Preset = Literal["fast", "default", "paper"]
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates at the start of the fit."""
+
+    means: float = 1.6e-2
+    """Of splat centres, in the unit box (supplement 1.1)."""
+    quats: float = 4e-3
+    """Of splat orientations."""
+    log_scales: float = 1e-2
+    """Of the logarithms of splat sizes."""
+    logit_opacities: float = 5e-2
+    """Of splat opacities."""
+    sh: float = 1e-2
+    """Of the constant colour; higher bands get a twentieth."""
+    tint: float = 5e-3
+    """Of the colour difference between the states, rgb."""
+    boxes: float = 3e-3
+    """Of the boxes' poses and half extents (T_0), radians and world units."""
+    motions: float = 3e-3
+    """Of the motions (T_1), radians and world units."""
+    final: float = 0.02
+    """Fraction of its start that the rates of centres, boxes and motions have fallen to at the end."""
+    appearance_final: float = 0.2
+    """The same for all other rates."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Densification and pruning, as in 3DGS."""
+
+    first: float = 0.1
+    """Part of the fit after which splats begin to multiply."""
+    last: float = 0.7
+    """Part of the fit after which they no longer do."""
+    interval: int = 100
+    """Steps between two rounds."""
+    gradient: float = 2e-4
+    """Mean screen-space gradient (in half image sizes) above which a splat is cloned or split."""
+    small: float = 0.01
+    """Splats smaller than this (times the object's size) are cloned, larger ones split."""
+    most: int = 60_000
+    """No more splats than this."""
+    faint: float = 0.005
+    """Splats of lower opacity go."""
+    outside: float = 0.1
+    """Splats whose centre is farther than this outside the unit box go."""
+    reset: int = 0
+    """Steps between two resets of the opacities; 0 for none."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """The whole fit.  Parts of the fit are fractions of `steps`."""
+
+    steps: int = 1800
+    """Optimiser steps, each with one view of either state."""
+    hypotheses: bool = True
+    """Search each part's motion before the fit; otherwise start from rest, as in the supplement."""
+    splats_per_part: int = 6000
+    """Splats strewn in each box at the start (supplement: 10,000)."""
+    sh_degree: int = 0
+    """Degree of the spherical harmonics."""
+    structure_until: int = 150
+    """Step at which the losses on boxes end."""
+    loose_until: int = 150
+    """Step at which contact and extent end."""
+    image_from: int = 150
+    """Step at which the image loss begins."""
+    structure_size: int = 96
+    """Longer side of the structure images, pixels."""
+    motions_with_structure: bool = False
+    """Whether the losses on boxes move the motions too."""
+    sizes: tuple[tuple[float, int], ...] = ((0.0, 200), (0.5, 400), (0.85, 800))
+    """(part of the fit, longer side of the images in pixels) from which on images have that size; never more than they have."""
+    image_weight: float = 10.0
+    """Of the image loss."""
+    ssim_weight: float = 0.2
+    """Share of D-SSIM in the image loss."""
+    alpha_weight: float = 0.5
+    """Of the mask's error beside the colour's."""
+    tint_penalty: float = 0.02
+    """Of the mean absolute colour difference between the states."""
+    one_joint_from: float = 0.6
+    """Part of the fit after which every motion is held to its joint's one degree of freedom; 1 for never."""
+    checkpoint_every: int = 250
+    """Steps between two checkpoints."""
+    rates: Rates = field(default_factory=Rates)
+    """Learning rates."""
+    growth: Growth = field(default_factory=Growth)
+    """Densification and pruning."""
+
+
+PRESETS: dict[Preset, FitConfig] = {
+    "fast": FitConfig(steps=700, structure_until=60, loose_until=60, image_from=60, sizes=((0.0, 200), (0.7, 320))),
+    "default": FitConfig(),
+    "paper": FitConfig(
+        steps=10_000,
+        hypotheses=False,
+        splats_per_part=10_000,
+        structure_until=10_000,
+        loose_until=1500,
+        image_from=400,
+        motions_with_structure=True,
+        sizes=((0.0, 1600),),
+        alpha_weight=0.0,
+        tint_penalty=0.0,
+        one_joint_from=1.0,
+        checkpoint_every=500,
+        rates=Rates(quats=1e-3, log_scales=5e-3, sh=2.5e-3, tint=0.0, boxes=1e-2, motions=1e-2, final=1.0, appearance_final=1.0),
+        growth=Growth(first=0.05, last=0.5, reset=3000),
+    ),
+}

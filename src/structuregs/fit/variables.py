@@ -1,0 +1,125 @@
+"""The quantities that a fit changes, as leaves for the optimiser, and the posed parts that they make."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..geometry import SE3, Box, JointKind
+from ..joints import screw_of_part
+from ..model import SH_C0, PosedParts, Splats
+
+SPLAT_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh", "tint")
+
+
+@dataclass
+class Variables:
+    """Leaves by name, with what places them.
+
+    Attributes:
+        leaves: the splats' tensors (`SPLAT_NAMES`), `box_quats`, `box_centres`, `log_half_extents` (K rows), `motions`
+            (K rows of 6: see `kinds`).
+        counts: splats of each part.
+        kinds: None while motions are free: then a row of `motions` is a tangent (v, omega) about the part's centre, on top
+            of `start`.  Afterwards the type of each moving part: a row is then the rotation vector and a point of its axis
+            (revolute), or the translation and zeros (prismatic).
+        start: K motions (wxyz_xyz) from which free motions count.
+        centres: K points about which free motions turn, as they stand in state 1.
+    """
+
+    leaves: dict[str, Tensor]
+    counts: tuple[int, ...]
+    kinds: tuple[JointKind, ...] | None
+    start: Float[Tensor, "K 7"]
+    centres: Float[Tensor, "K 3"]
+
+    @staticmethod
+    def of(parts: PosedParts) -> "Variables":
+        """Variables whose values are the given parts."""
+        parts = parts.detach()
+        pose = parts.boxes.T_world_box
+        leaves = parts.splats.tensors() | {
+            "tint": parts.tint,
+            "box_quats": pose.wxyz,
+            "box_centres": pose.xyz,
+            "log_half_extents": parts.boxes.half_extents.log(),
+            "motions": torch.zeros(len(parts), 6, device=pose.xyz.device),
+        }
+        leaves = {name: value.clone().contiguous().requires_grad_() for name, value in leaves.items()}
+        return Variables(leaves, parts.counts, None, parts.motions.wxyz_xyz.clone(), parts.motions.apply(pose.xyz))
+
+    def boxes(self) -> Box:
+        """The boxes in state 0."""
+        pose = SE3.from_quat(self.leaves["box_quats"], self.leaves["box_centres"])
+        return Box(pose, self.leaves["log_half_extents"].exp())
+
+    def motions(self) -> SE3:
+        """The motions; the base's is the identity whatever its row says."""
+        rows = self.leaves["motions"][1:]
+        still = self.start.new_tensor([[1.0, 0, 0, 0, 0, 0, 0]])
+        if self.kinds is None:
+            turn = SE3.exp(rows)
+            centres = self.centres[1:]
+            xyz = turn.xyz + centres - (turn.rotation @ centres[..., None])[..., 0]
+            moved = SE3.from_quat(turn.wxyz, xyz) @ SE3(self.start[1:])
+        else:
+            turns = torch.tensor([[kind == "revolute"] for kind in self.kinds], device=rows.device)
+            zeros = torch.zeros_like(rows[:, :3])
+            omega = torch.where(turns, rows[:, :3], zeros)
+            turn = SE3.exp(torch.cat([zeros, omega], -1))
+            about = rows[:, 3:] - (turn.rotation @ rows[:, 3:, None])[..., 0]
+            moved = SE3.from_quat(turn.wxyz, torch.where(turns, about, rows[:, :3]))
+        return SE3(torch.cat([still, moved.wxyz_xyz]))
+
+    def parts(self) -> PosedParts:
+        """The posed parts, with gradients to the leaves."""
+        splats = Splats(**{name: self.leaves[name] for name in SPLAT_NAMES if name != "tint"})
+        return PosedParts(self.boxes(), self.motions(), splats, self.counts, self.leaves["tint"])
+
+    def hold(self, kinds: Sequence[JointKind]) -> None:
+        """From here on every motion has its joint's one degree of freedom; the leaf `motions` is set in place."""
+        rows = torch.zeros_like(self.leaves["motions"])
+        with torch.no_grad():
+            motions, boxes = self.motions(), self.boxes()
+            for k, kind in enumerate(kinds, start=1):
+                screw, q = screw_of_part(motions[k], kind, boxes.T_world_box.xyz[k])
+                rows[k, :3] = screw.axis.to(rows) * q
+                if kind == "revolute":
+                    rows[k, 3:] = screw.origin.to(rows)
+            self.leaves["motions"].copy_(rows)
+        self.kinds = tuple(kinds)
+
+
+def strewn(
+    boxes: Box, motions: SE3, per_part: int, sh_degree: int, generator: torch.Generator, rgb: Float[Tensor, " 3"]
+) -> PosedParts:
+    """Parts whose boxes are evenly strewn with faint splats of one colour (supplement 1.1: uniform in [-1, 1]^3)."""
+    K = len(boxes.half_extents)
+    means = torch.rand(K * per_part, 3, generator=generator) * 2 - 1
+    # Each splat about as large as its share of the box.
+    spacing = (boxes.volume / per_part) ** (1 / 3)
+    log_scales = (0.5 * spacing).log().repeat_interleave(per_part)[:, None].expand(-1, 3)
+    sh = torch.zeros(K * per_part, (sh_degree + 1) ** 2, 3)
+    sh[:, 0] = (rgb - 0.5) / SH_C0
+    splats = Splats(
+        means,
+        torch.tensor([1.0, 0, 0, 0]).repeat(K * per_part, 1),
+        log_scales.contiguous().float(),
+        torch.full((K * per_part,), -2.2),
+        sh,
+    )
+    return PosedParts(boxes, motions, splats, (per_part,) * K, torch.zeros(K * per_part, 3))
+
+
+def part_index(counts: tuple[int, ...], device: torch.device) -> Int[Tensor, " N"]:
+    """The part of each splat, for splats in the order of their parts."""
+    return torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)).to(device)
+
+
+def detached(variables: Variables) -> PosedParts:
+    """The posed parts without history."""
+    with torch.no_grad():
+        return variables.parts().detach()
+
