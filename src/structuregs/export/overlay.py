@@ -68,7 +68,7 @@ def _draw_view(view: View, obj: ArticulatedObject, boxes: Box, size: int) -> np.
     width = round(size * view.camera.width / view.camera.height)
     rgb, _ = view.image(width, size)
     photo = Image.fromarray((rgb * 255).round().astype(np.uint8)).resize((width * _FINER, size * _FINER))
-    pen = _Pen(photo, view.camera.resized(width * _FINER, size * _FINER))
+    pen = Pen(photo, view.camera.resized(width * _FINER, size * _FINER))
     for k, edges in enumerate(boxes.edges):
         for edge in edges:
             pen.line(edge, colour_of(k), 1.5)
@@ -84,7 +84,7 @@ def colour_of(part: int) -> Colour:
     return _PARTS[(part - 1) % len(_PARTS)] if part else _BASE
 
 
-def joint_strokes(joint: Joint, box: Box) -> list[Float[Tensor, "P 3"]]:
+def joint_strokes(joint: Joint, box: Box) -> list[Float[Tensor, "_ 3"]]:
     """The lines that draw a joint, in the world.
 
     Args:
@@ -112,7 +112,7 @@ def _across(v: Float[Tensor, " 3"], axis: Float[Tensor, " 3"]) -> Float[Tensor, 
     return v - axis * (axis @ v)
 
 
-def _arrow(line: Float[Tensor, "P 3"]) -> list[Float[Tensor, "P 3"]]:
+def _arrow(line: Float[Tensor, "P 3"]) -> list[Float[Tensor, "_ 3"]]:
     """A line with a head of four barbs at its last point."""
     tip, back = line[-1], line[-2] - line[-1]
     length = 0.12 * float((line[1:] - line[:-1]).norm(dim=-1).sum())
@@ -126,7 +126,7 @@ def _arrow(line: Float[Tensor, "P 3"]) -> list[Float[Tensor, "P 3"]]:
     return [line, *barbs]
 
 
-class _Pen:
+class Pen:
     """Draws lines of the world on a picture."""
 
     def __init__(self, picture: Image.Image, camera: Camera) -> None:
