@@ -15,7 +15,7 @@ from .objects import KnownObject, KnownPart, Texture, TexturedBox, TextureKind
 
 _GAP = 0.012  # between a front and its neighbours
 _BOARD = 0.05  # thickness of boards
-_Point = tuple[float, float, float]
+_Point = tuple[float | int, float | int, float | int]
 
 
 @dataclass(frozen=True)
@@ -66,24 +66,26 @@ def random_object(seed: int, parts: int) -> KnownObject:
 
 def _cabinet(rng: np.random.Generator) -> KnownObject:
     """A door below and a drawer above, both shut in state 0."""
-    rows = [[Front("door", 0, rng.uniform(60, 75))], [Front("drawer", 0, rng.uniform(0.55, 0.7))]]
+    rows = [[Front("door", 0.0, rng.uniform(60, 75))], [Front("drawer", 0.0, rng.uniform(0.55, 0.7))]]
     return _cupboard("cabinet", rng, rng.uniform(1.0, 1.2), rng.uniform(0.75, 0.9), rng.uniform(1.2, 1.4), rows, (0.65, 0.35))
 
 
 def _fridge(rng: np.random.Generator) -> KnownObject:
     """Two doors with hinges on one side: the lower one ajar in state 0, the upper one shut."""
-    rows = [[Front("door", 20, rng.uniform(75, 90), "right")], [Front("door", 0, rng.uniform(50, 60), "right")]]
+    rows = [[Front("door", 20.0, rng.uniform(75, 90), "right")], [Front("door", 0.0, rng.uniform(50, 60), "right")]]
     return _cupboard("fridge", rng, rng.uniform(0.7, 0.85), rng.uniform(0.65, 0.8), rng.uniform(1.5, 1.7), rows, (0.62, 0.38))
 
 
 def _door(rng: np.random.Generator) -> KnownObject:
     """One door, ajar in state 0."""
-    return _cupboard("door", rng, 1.0, rng.uniform(0.6, 0.8), rng.uniform(1.1, 1.3), [[Front("door", 15, rng.uniform(60, 75))]])
+    return _cupboard(
+        "door", rng, 1.0, rng.uniform(0.6, 0.8), rng.uniform(1.1, 1.3), [[Front("door", 15.0, rng.uniform(60, 75))]]
+    )
 
 
 def _drawer(rng: np.random.Generator) -> KnownObject:
     """One drawer below an open compartment, shut in state 0."""
-    rows = [[Front("drawer", 0, rng.uniform(0.5, 0.7))], [Front("open")]]
+    rows = [[Front("drawer", 0.0, rng.uniform(0.5, 0.7))], [Front("open")]]
     return _cupboard("drawer", rng, rng.uniform(1.0, 1.3), rng.uniform(0.7, 0.9), 0.9, rows)
 
 
@@ -93,20 +95,20 @@ def _laptop(rng: np.random.Generator) -> KnownObject:
     shell = _texture(rng, "noise")
     base = [
         _board((-w, -d, 0), (w, d, 0.07), shell),
-        _board((-0.85 * w, -0.2 * d, 0.07), (0.85 * w, 0.8 * d, 0.085), _texture(rng, "checker", 9)),
+        _board((-0.85 * w, -0.2 * d, 0.07), (0.85 * w, 0.8 * d, 0.085), _texture(rng, "checker", 9.0)),
         _board((-0.25 * w, -0.85 * d, 0.07), (0.25 * w, -0.35 * d, 0.078), _texture(rng, "plain")),
     ]
     screen = [
         _board((-w, -d, 0.09), (w, d, 0.14), replace(shell, seed=shell.seed + 1)),
-        _board((-0.9 * w, -0.85 * d, 0.082), (0.9 * w, 0.85 * d, 0.09), _texture(rng, "stripes", 3)),
+        _board((-0.9 * w, -0.85 * d, 0.082), (0.9 * w, 0.85 * d, 0.09), _texture(rng, "stripes", 3.0)),
     ]
-    joint = _hinge((-1, 0, 0), (0, d, 0.09), 40, rng.uniform(100, 115))
+    joint = _hinge((-1, 0, 0), (0, d, 0.09), 40.0, rng.uniform(100, 115))
     return KnownObject("laptop", (KnownPart("base", tuple(base)), _opened("screen", screen, joint)))
 
 
 def _slider(rng: np.random.Generator) -> KnownObject:
     """A carriage on a rail, in plain sight in both states."""
-    rail, stop = _texture(rng, "stripes", 4), _texture(rng, "checker", 6)
+    rail, stop = _texture(rng, "stripes", 4.0), _texture(rng, "checker", 6.0)
     base = [
         _board((-1, -0.25, 0), (1, 0.25, 0.1), rail),
         _board((-1, -0.06, 0.1), (1, 0.06, 0.2), _texture(rng, "wood")),
@@ -115,7 +117,7 @@ def _slider(rng: np.random.Generator) -> KnownObject:
     ]
     half, height = rng.uniform(0.18, 0.25), rng.uniform(0.45, 0.6)
     carriage = [
-        _board((-0.9, -0.22, 0.21), (-0.9 + 2 * half, 0.22, height), _texture(rng, "checker", 5)),
+        _board((-0.9, -0.22, 0.21), (-0.9 + 2 * half, 0.22, height), _texture(rng, "checker", 5.0)),
         _board((-0.85, -0.08, height), (-0.9 + 1.4 * half, 0.08, height + 0.15), _texture(rng, "noise")),
     ]
     joint = TrueJoint("prismatic", (1.0, 0.0, 0.0), (0.0, 0.0, 0.2), 0.0, rng.uniform(0.7, 0.9))
@@ -126,23 +128,23 @@ def _stapler(rng: np.random.Generator) -> KnownObject:
     """An arm that reaches across its hinge to both sides."""
     length, metal = rng.uniform(0.95, 1.15), _texture(rng, "plain")
     base = [
-        _board((-0.2, -length, 0), (0.2, 0.35, 0.08), _texture(rng, "checker", 5)),
+        _board((-0.2, -length, 0), (0.2, 0.35, 0.08), _texture(rng, "checker", 5.0)),
         _board((-0.2, -0.12, 0.08), (-0.14, 0.12, 0.46), metal),
         _board((0.14, -0.12, 0.08), (0.2, 0.12, 0.46), metal),
     ]
     arm = [
-        _board((-0.13, -length, 0.27), (0.13, 0.2, 0.42), _texture(rng, "stripes", 5)),
+        _board((-0.13, -length, 0.27), (0.13, 0.2, 0.42), _texture(rng, "stripes", 5.0)),
         _board((-0.08, -0.97 * length, 0.22), (0.08, -0.2, 0.27), _texture(rng, "noise")),
     ]
-    joint = _hinge((-1, 0, 0), (0, 0, 0.34), 5, rng.uniform(40, 50))
+    joint = _hinge((-1, 0, 0), (0, 0, 0.34), 5.0, rng.uniform(40, 50))
     return KnownObject("stapler", (KnownPart("base", tuple(base)), _opened("arm", arm, joint)))
 
 
 def _chest(rng: np.random.Generator) -> KnownObject:
     """A chest with a hollow lid, ajar in state 0."""
     w, d, h, t = rng.uniform(0.7, 0.85), rng.uniform(0.42, 0.5), rng.uniform(0.5, 0.65), _BOARD
-    wood, lid = _texture(rng, "wood"), _texture(rng, "stripes", 3)
-    joint = _hinge((-1, 0, 0), (0, d, h), 15, rng.uniform(70, 85))
+    wood, lid = _texture(rng, "wood"), _texture(rng, "stripes", 3.0)
+    joint = _hinge((-1, 0, 0), (0, d, h), 15.0, rng.uniform(70, 85))
     base = [_board((-w, -d, 0), (w, d, t), wood), *_walls((-w, -d, t), (w, d, h), t, wood)]
     top = h + 0.2
     cover = [_board((-w, -d, top), (w, d, top + t), lid), *_walls((-w, -d, h + 0.005), (w, d, top), t, lid)]
@@ -153,14 +155,16 @@ def _chest(rng: np.random.Generator) -> KnownObject:
 def _static(rng: np.random.Generator) -> KnownObject:
     """A stool: nothing moves."""
     legs = _texture(rng, "wood")
-    boxes = [_board((-0.6, -0.5, 0.7), (0.6, 0.5, 0.8), _texture(rng, "checker", 3))]
+    boxes = [_board((-0.6, -0.5, 0.7), (0.6, 0.5, 0.8), _texture(rng, "checker", 3.0))]
     boxes += [_board((x - 0.06, y - 0.06, 0), (x + 0.06, y + 0.06, 0.7), legs) for x in (-0.5, 0.5) for y in (-0.4, 0.4)]
     return KnownObject("static", (KnownPart("base", tuple(boxes)),))
 
 
 def _block(rng: np.random.Generator) -> KnownObject:
     """One convex block: nothing moves."""
-    return KnownObject("block", (KnownPart("base", (_board((-0.6, -0.4, 0), (0.6, 0.4, 0.5), _texture(rng, "checker", 3)),)),))
+    return KnownObject(
+        "block", (KnownPart("base", (_board((-0.6, -0.4, 0), (0.6, 0.4, 0.5), _texture(rng, "checker", 3.0)),)),)
+    )
 
 
 OBJECTS: dict[str, Callable[[np.random.Generator], KnownObject]] = {
@@ -250,7 +254,8 @@ def _walls(low: _Point, high: _Point, t: float, texture: Texture) -> list[Textur
 
 
 def _hinge(axis: _Point, origin: _Point, q0_deg: float, q1_deg: float) -> TrueJoint:
-    return TrueJoint("revolute", axis, origin, math.radians(q0_deg), math.radians(q1_deg))
+    (x, y, z), (a, b, c) = map(float, axis), map(float, origin)
+    return TrueJoint("revolute", (x, y, z), (a, b, c), math.radians(q0_deg), math.radians(q1_deg))
 
 
 def _opened(name: str, boxes: Sequence[TexturedBox], joint: TrueJoint) -> KnownPart:

@@ -2,13 +2,14 @@
 
 import math
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 from ..capture import Capture, Layout, View, save_capture, save_truth
 from ..geometry import SE3, Camera
@@ -50,8 +51,11 @@ def make_capture(obj: KnownObject, options: RenderOptions | None = None) -> Capt
     """Photographs of a known object in its two states, in memory, with depth; the cameras of no two sets agree."""
     options = options or RenderOptions()
     generator = np.random.default_rng(options.seed)
-    train = [_photograph(obj, state, options.views, options, generator) for state in (0, 1)]
-    test = [_photograph(obj, state, options.test_views, options, generator) for state in (0, 1)]
+    counts = (options.views, options.views, options.test_views, options.test_views)
+    # All azimuths are drawn before any noise, so that pictures with and without noise have the same cameras.
+    orbits = [orbit(obj, n, options, azimuth) for n, azimuth in zip(counts, generator.uniform(0, 2 * math.pi, 4), strict=True)]
+    train = [_photograph(obj, state, orbits[state], options, generator) for state in (0, 1)]
+    test = [_photograph(obj, state, orbits[2 + state], options, generator) for state in (0, 1)]
     return Capture(obj.name, Path(obj.name), (train[0], train[1]), (test[0], test[1]), "memory")
 
 
@@ -95,21 +99,28 @@ def _looking_along(forward: Float64[np.ndarray, " 3"], position: Float64[np.ndar
 
 
 def _photograph(
-    obj: KnownObject, state: int, count: int, options: RenderOptions, generator: np.random.Generator
+    obj: KnownObject, state: int, cameras: Sequence[Camera], options: RenderOptions, generator: np.random.Generator
 ) -> tuple[View, ...]:
-    """Views of one state from a spiral with a random start."""
-    cameras = orbit(obj, count, options, generator.uniform(0, 2 * math.pi))
+    """Views of one state."""
     boxes = [box for part in obj.parts for box in part.at_state(state)]
     exposure = options.lighting.exposure * (options.exposure_change if state else 1.0)
     lighting = replace(options.lighting, exposure=exposure)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         pictures = list(pool.map(lambda camera: draw(boxes, camera, lighting, options.samples), cameras))
-    views = []
-    for i, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
-        rgba = picture.rgba
-        if options.noise:
-            noisy = rgba[..., :3] + 255 * options.noise * generator.standard_normal(rgba[..., :3].shape)
-            covered = rgba[..., 3:] > 0
-            rgba = np.concatenate([np.where(covered, np.rint(noisy.clip(0, 255)), 0).astype(np.uint8), rgba[..., 3:]], -1)
-        views.append(View(f"{i:04d}", camera, rgba, picture.depth))
-    return tuple(views)
+    return tuple(
+        View(f"{i:04d}", camera, _with_noise(picture.rgba, options.noise, generator), picture.depth)
+        for i, (camera, picture) in enumerate(zip(cameras, pictures, strict=True))
+    )
+
+
+def _with_noise(
+    rgba: UInt8[np.ndarray, "H W 4"], deviation: float, generator: np.random.Generator
+) -> UInt8[np.ndarray, "H W 4"]:
+    """The image with normal errors added to the colours wherever the object is."""
+    if not deviation:
+        return rgba
+    noisy = rgba.copy()
+    covered = rgba[..., 3] > 0
+    error = 255 * deviation * generator.standard_normal((int(covered.sum()), 3))
+    noisy[covered, :3] = np.rint(rgba[covered, :3] + error).clip(0, 255)
+    return noisy
