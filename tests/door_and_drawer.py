@@ -33,7 +33,7 @@ def made_of(*motions: SE3, centres: tuple[tuple[float, float, float], ...] = CEN
     return articulate(PosedParts(boxes, SE3(moves), splats, (120,) * n, torch.zeros(120 * n, 3)))
 
 
-def photographed(obj: ArticulatedObject, test_views: int = 2) -> Capture:
+def photographed(obj: ArticulatedObject, views: int = 2) -> Capture:
     """A capture in memory whose views are the object's own renderings, rounded to bytes."""
     camera = Camera(SE3.from_quat(torch.tensor([1.0, 0, 0, 0]), torch.tensor([0.0, 0, -4])), 60.0, 60.0, 20.0, 16.0, 40, 32)
     rows = []
@@ -42,5 +42,5 @@ def photographed(obj: ArticulatedObject, test_views: int = 2) -> Capture:
         alpha = (image.alpha > 0.02).byte() * 255
         rgb = (image.rgb.clamp(0, 1) * 255).round().byte()
         rgba = torch.cat([torch.where(alpha[..., None] > 0, rgb, 255), alpha[..., None]], -1).numpy()
-        rows.append(tuple(View(f"{i:04d}", camera, rgba) for i in range(test_views)))
+        rows.append(tuple(View(f"{i:04d}", camera, rgba) for i in range(views)))
     return Capture("made", Path("made"), (rows[0], rows[1]), (rows[0], rows[1]), "memory")

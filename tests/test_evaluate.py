@@ -117,7 +117,7 @@ def test_psnr_looks_at_each_state_in_its_own_place():
 
 def test_psnr_is_a_mean_over_images_not_over_states():
     obj = made_of(DOOR.motion())
-    capture = photographed(obj, test_views=3)
+    capture = photographed(obj, views=3)
     dark = replace(capture.test[1][0], rgba=capture.test[0][0].rgba * np.array([0, 0, 0, 1], np.uint8))
     report = evaluate_object(obj, replace(capture, test=(capture.test[0], (dark,))), None)
     a, b = report.psnr_by_state

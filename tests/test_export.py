@@ -93,8 +93,8 @@ def test_a_turn_is_drawn_as_its_axis_past_the_box_and_an_arc_of_its_angle():
 def test_the_overview_shows_both_states_with_boxes_over_the_photos(obj, tmp_path):
     capture = photographed(obj)
     picture = draw_structure(capture, obj, columns=2, size=60)
-    assert picture.width == 2 * 60
-    assert picture.height > 2 * 60
+    assert picture.width == 2 * 75
+    assert picture.height > 2 * 60  # and the legend
     write_structure(capture, obj, tmp_path / "overview.png")
     assert [p.name for p in tmp_path.iterdir()] == ["overview.png"]
     pixels = np.asarray(picture)[-120:].reshape(-1, 3).astype(int)

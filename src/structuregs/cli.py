@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from .fit.schedule import PRESETS, Preset
+
 if TYPE_CHECKING:
     from .capture import TrueJoint
     from .evaluate import JointScore, Report
@@ -26,7 +28,7 @@ Picture = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
 def fit(
     capture: CaptureFolder,
     run: NewRun,
-    preset: Literal["fast", "default", "paper"] = "default",
+    preset: Preset = "default",
     views: int | None = None,
     parts: int | None = None,
     seed: int = 0,
@@ -131,7 +133,7 @@ def _fit(
     capture: Path,
     run: Path,
     *,
-    preset: Literal["fast", "default", "paper"],
+    preset: Preset,
     views: int | None = None,
     parts: int | None = None,
     seed: int = 0,
@@ -140,7 +142,7 @@ def _fit(
 ) -> "ArticulatedObject":
     from .capture import load_capture
     from .export import write_structure
-    from .fit.reconstruct import PRESETS, fit_run
+    from .fit.reconstruct import fit_run
 
     photos = load_capture(capture, views=views, seed=seed)
     events = fit_run(photos, run, PRESETS[preset], device=device, parts=parts, points=points, seed=seed)
