@@ -11,289 +11,357 @@ import math
 import numpy as np
 from numba import prange
 
-from .jit import fast_exp, kernel
+from .jit import fast_exp2, kernel
 from .records import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 TILE = 16
-ROW = 16  # values in a splat's row of `pack`: one cache line
-PARTIALS = 10  # values in a pair's row of partial gradients: xy (2), conic (3), opacity, rgb (3), depth
-_MAX_ALPHA, _MIN_ALPHA, _MIN_T = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
+PARTIALS = 10  # moments of the exponent's gradient (1, x, y, xx, xy, yy), then the gradients of rgb and depth
+_MIN_ALPHA, _MIN_T = np.float32(MIN_ALPHA), np.float32(MIN_TRANSMITTANCE)
 _ZERO, _ONE, _TWO, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
+_TINY = np.float32(1e-30)
+_LOG2_E = np.float32(math.log2(math.e))
+_LOWEST, _HIGHEST = np.float32(math.log2(MIN_ALPHA) - 0.01), np.float32(math.log2(MAX_ALPHA))
 _SLACK = np.float32(1e-2)  # pixels; spans are rounded outwards, each pixel's own alpha decides
+# Where the planes of a tile lie after that of transmittance; the sums of the columns and the terms of the rows share one.
+_R, _G, _B, _D, _S, _SUMS = (plane * TILE * TILE for plane in range(1, 7))
+_ROWS = _SUMS + 8 * TILE
 _CHECK = 16  # splats between two looks at whether a tile is full
 
 
 @kernel()
-def pack(xy, conic, opacity, rgb, depth, extent, rows):
-    """Fills rows (N 16): centre (with pixel centres at integers), conic, opacity, rgb, depth, extent, ln-limit, unused."""
-    for i in range(len(xy)):
-        rows[i, 0], rows[i, 1] = xy[i, 0] - _HALF, xy[i, 1] - _HALF
-        rows[i, 2], rows[i, 3], rows[i, 4] = conic[i, 0], conic[i, 1], conic[i, 2]
-        rows[i, 5] = opacity[i]
-        rows[i, 6], rows[i, 7], rows[i, 8] = rgb[i, 0], rgb[i, 1], rgb[i, 2]
-        rows[i, 9] = depth[i]
-        rows[i, 10], rows[i, 11] = extent[i, 0], extent[i, 1]
-        rows[i, 12] = _TWO * np.float32(math.log(max(opacity[i] / _MIN_ALPHA, _ONE)))
+def pack(xy, conic, opacity, rgb, depth, extent):
+    """The blend's own tables of the splats, one cache line and half of one for each.
 
-
-@kernel()
-def _span(p, q, r, limit, eu, ev, low, high):
-    """Range of v in the part of the ellipse p u^2 + 2 q u v + r v^2 <= limit with low <= u <= high; empty as (1, 0).
-
-    eu, ev: the ellipse's half sizes, which stay exact for thin ellipses where p r - q^2 cancels.
-    """
-    low, high = max(low, -eu), min(high, eu)
-    if low > high:
-        return _ONE, _ZERO
-    turn = -q / p * ev  # u where v is largest
-    a, b = min(max(turn, low), high), min(max(-turn, low), high)
-    top = math.sqrt(limit * r * max(_ONE - (a / eu) * (a / eu), _ZERO))
-    bottom = math.sqrt(limit * r * max(_ONE - (b / eu) * (b / eu), _ZERO))
-    return np.float32((-q * b - bottom) / r - _SLACK), np.float32((-q * a + top) / r + _SLACK)
-
-
-@kernel()
-def _tile_rows(s, height):
-    """First and one past the last row of tiles that a splat's row reaches."""
-    low = max(math.floor(max(s[1] - s[11], _ZERO)) // TILE, 0)
-    high = min(s[1] + s[11], np.float32(height - 1))
-    return int(low), int(math.floor(high) // TILE) + 1 if high >= 0 else 0
-
-
-@kernel()
-def _tile_columns(s, row, width):
-    """First and one past the last tile that a splat's row reaches in a row of tiles."""
-    v = np.float32(row * TILE) - s[1]
-    left, right = _span(s[4], s[3], s[2], s[12], s[11], s[10], v - _SLACK, v + np.float32(TILE - 1) + _SLACK)
-    left, right = max(s[0] + left, _ZERO), min(s[0] + right, np.float32(width - 1))
-    if left > right:
-        return 0, 0
-    # Pixels are at integers: a tile whose last pixel lies left of the span is not reached.
-    return int(math.ceil(left)) // TILE, int(math.floor(right)) // TILE + 1
-
-
-@kernel()
-def tile_lists(rows, order, width, height):
-    """Which splats each tile draws, from near to far.
-
-    Args:
-        rows: see `pack`.
-        order: the drawn splats by depth.
-        width, height: of the image, pixels.
+    The ellipse that a splat reaches is a u^2 + 2 b u v + c v^2 <= limit around its centre.  At a given u it spans
+    v = -slope u +- sqrt(level - bend u^2), and v is largest at u = turn.
 
     Returns:
-        starts: where each tile's list begins in `splats`, and the total (tiles + 1).
-        splats: the lists.
-        pair_starts: where each splat's pairs begin in `pairs`, and the total (N + 1).
-        pairs: positions in `splats`.
+        drawing: (N 16) centre (with pixel centres at integers); a, b, c and peak of log2 alpha = peak + a dx^2 + b dx dy
+            + c dy^2; rgb, depth; then for u = x: extent, turn, slope, level, bend.
+        reach: (N 8) centre and extents; then for u = y: turn, slope, level, bend.
     """
-    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    starts = np.zeros(across * down + 1, np.int64)
-    pair_starts = np.zeros(len(rows) + 1, np.int64)
-    for q in range(len(order)):
-        s = rows[order[q]]
-        y0, y1 = _tile_rows(s, height)
-        for y in range(y0, y1):
-            x0, x1 = _tile_columns(s, y, width)
-            for x in range(x0, x1):
-                starts[y * across + x + 1] += 1
-            pair_starts[order[q] + 1] += max(x1 - x0, 0)
-    for t in range(across * down):
-        starts[t + 1] += starts[t]
-    for i in range(len(rows)):
-        pair_starts[i + 1] += pair_starts[i]
-    splats, pairs = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
-    heads = starts[:-1].copy()
-    for q in range(len(order)):
-        i = order[q]
-        pair = pair_starts[i]
-        s = rows[i]
-        y0, y1 = _tile_rows(s, height)
-        for y in range(y0, y1):
-            x0, x1 = _tile_columns(s, y, width)
-            for x in range(x0, x1):
-                k = heads[y * across + x]
-                heads[y * across + x] = k + 1
-                splats[k] = i
-                pairs[pair] = k
-                pair += 1
-    return starts, splats, pair_starts, pairs
+    drawing, reach = np.empty((len(xy), 16), np.float32), np.empty((len(xy), 8), np.float32)
+    for i in range(len(xy)):
+        a, b, c, o = conic[i, 0], conic[i, 1], conic[i, 2], opacity[i]
+        ex, ey = extent[i, 0], extent[i, 1]
+        limit = _TWO * np.float32(math.log(max(o / _MIN_ALPHA, _ONE)))
+        d, r = drawing[i], reach[i]
+        d[0], d[1] = xy[i, 0] - _HALF, xy[i, 1] - _HALF
+        d[2], d[3], d[4] = -_HALF * _LOG2_E * a, -_LOG2_E * b, -_HALF * _LOG2_E * c
+        d[5] = np.float32(math.log2(max(o, _TINY)))
+        d[6], d[7], d[8], d[9] = rgb[i, 0], rgb[i, 1], rgb[i, 2], depth[i]
+        # From the extents, not from a c - b^2, which cancels for thin ellipses.
+        d[10], d[11], d[12], d[13], d[14] = ex, -b / a * ey, b / c, limit / c, limit / c / max(ex * ex, _TINY)
+        r[0], r[1], r[2], r[3] = d[0], d[1], ex, ey
+        r[4], r[5], r[6], r[7] = -b / c * ex, b / a, limit / a, limit / a / max(ey * ey, _TINY)
+    return drawing, reach
 
 
 @kernel()
-def _pixel_rows(s, x0, y0):
-    """First and one past the last row of a tile that a splat reaches."""
-    u = np.float32(x0) - s[0]
-    low, high = _span(s[2], s[3], s[4], s[12], s[10], s[11], u - _SLACK, u + np.float32(TILE - 1) + _SLACK)
-    base = s[1] - np.float32(y0)
-    low, high = max(base + low, _ZERO), min(base + high, np.float32(TILE - 1))
+def _ceil(x):
+    """Smallest integer >= x for x >= 0; `math.ceil` is a call."""
+    whole = np.int32(x)
+    return whole + 1 if np.float32(whole) < x else whole
+
+
+@kernel()
+def _span(extent, turn, slope, level, bend, low, high):
+    """Range of v of the ellipse's part with low <= u <= high (see `pack`), relative to the centre; empty as (1, 0)."""
+    low, high = max(low - _SLACK, -extent), min(high + _SLACK, extent)
+    if low > high:
+        return _ONE, _ZERO
+    u, w = min(max(turn, low), high), min(max(-turn, low), high)
+    top = np.float32(math.sqrt(max(level - bend * u * u, _ZERO))) - slope * u
+    bottom = np.float32(math.sqrt(max(level - bend * w * w, _ZERO))) + slope * w
+    return -bottom - _SLACK, top + _SLACK
+
+
+@kernel()
+def _tile_columns(r, row, last):
+    """First and one past the last tile that a splat reaches in a row of tiles; last: the image's last column."""
+    v = np.float32(row * TILE) - r[1]
+    left, right = _span(r[3], r[4], r[5], r[6], r[7], v, v + np.float32(TILE - 1))
+    left, right = max(r[0] + left, _ZERO), min(r[0] + right, last)
+    if not left <= right:
+        return 0, 0
+    # Pixels are at integers: a tile whose last pixel lies left of the span is not reached.
+    return (_ceil(left) // TILE, np.int32(right) // TILE + 1)
+
+
+@kernel()
+def _tile_rows(r, first, past):
+    """First and one past the last row of tiles that a splat reaches, within [first, past)."""
+    low = max(r[1] - r[3], np.float32(first * TILE))
+    high = min(r[1] + r[3], np.float32(past * TILE - 1))
     if not low <= high:
         return 0, 0
-    return int(math.ceil(low)), int(math.floor(high)) + 1
+    return _ceil(low) // TILE, np.int32(high) // TILE + 1
+
+
+@kernel()
+def depth_order(depth, extent):
+    """Indices of the drawn splats from near to far, ties by index: a radix sort of the floats' bits."""
+    ids, keys = np.empty(len(depth), np.int32), np.empty(len(depth), np.uint32)
+    n = 0
+    for i in range(len(depth)):
+        if extent[i, 0] > 0:
+            bits = np.float32(depth[i]).view(np.uint32)
+            ids[n] = i
+            keys[n] = bits ^ (np.uint32(0xFFFFFFFF) if bits >> np.uint32(31) else np.uint32(0x80000000))
+            n += 1
+    ids, keys = ids[:n], keys[:n]
+    ids_out, keys_out = np.empty_like(ids), np.empty_like(keys)
+    for shift in (0, 11, 22):
+        heads = np.zeros(2049, np.int64)
+        for q in range(n):
+            heads[((keys[q] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
+        for d in range(2048):
+            heads[d + 1] += heads[d]
+        for q in range(n):
+            digit = (keys[q] >> np.uint32(shift)) & np.uint32(2047)
+            ids_out[heads[digit]], keys_out[heads[digit]] = ids[q], keys[q]
+            heads[digit] += 1
+        ids, keys, ids_out, keys_out = ids_out, keys_out, ids, keys
+    return ids
 
 
 @kernel(parallel=True)
-def blend_forward(starts, splats, rows, background, lanes, image, alpha, depth, ends):
+def tile_lists(reach, order, width, height, lanes):
+    """Which splats each tile draws, from near to far; lanes: threads, each of which takes a band of tile rows.
+
+    Returns:
+        starts: where each tile's list begins in `splats`, and the total (tiles + 1).
+        splats: the lists, one after the other.
+    """
+    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    heads = np.zeros(across * down + 1, np.int64)
+    last = np.float32(width - 1)
+    for lane in prange(lanes):
+        for q in range(len(order)):
+            r = reach[order[q]]
+            y0, y1 = _tile_rows(r, down * lane // lanes, down * (lane + 1) // lanes)
+            for y in range(y0, y1):
+                x0, x1 = _tile_columns(r, y, last)
+                for x in range(x0, x1):
+                    heads[y * across + x + 1] += 1
+    for tile in range(across * down):
+        heads[tile + 1] += heads[tile]
+    starts, splats = heads.copy(), np.empty(heads[-1], np.int32)
+    for lane in prange(lanes):
+        for q in range(len(order)):
+            r = reach[order[q]]
+            y0, y1 = _tile_rows(r, down * lane // lanes, down * (lane + 1) // lanes)
+            for y in range(y0, y1):
+                x0, x1 = _tile_columns(r, y, last)
+                for x in range(x0, x1):
+                    splats[heads[y * across + x]] = order[q]
+                    heads[y * across + x] += 1
+    return starts, splats
+
+
+@kernel()
+def _pixel_rows(d, u, v):
+    """First and one past the last row of a tile that a splat reaches; u, v: the tile's first pixel less the centre."""
+    low, high = _span(d[10], d[11], d[12], d[13], d[14], u, u + np.float32(TILE - 1))
+    low, high = max(low - v, _ZERO), min(high - v, np.float32(TILE - 1))
+    if not low <= high:
+        return 0, 0
+    return _ceil(low), np.int32(high) + 1
+
+
+@kernel()
+def _planes(count):
+    """Zeros for `count` tiles, and where the first begins: at a cache line, for a row that straddles two costs double.
+
+    One flat array and bounded row numbers let the compiler see that rows do not overlap, and keep sums in registers.
+    """
+    memory = np.zeros((count * TILE + 1) * TILE, np.float32)
+    return memory, (-(memory.ctypes.data // 4)) & 15
+
+
+@kernel()
+def _row_terms(M, terms, gy, s):
+    """Writes what the exponent's rows have in common: constant and linear term in dx, and dy."""
+    b, c, peak = s[3], s[4], s[5]
+    for y in range(TILE):
+        dy = gy - np.float32(np.int32(y))
+        M[terms + y] = peak + c * dy * dy
+        M[terms + TILE + y] = b * dy
+        M[terms + 2 * TILE + y] = dy
+
+
+@kernel(parallel=True)
+def blend_forward(starts, splats, drawing, background, lanes, image, alpha, depth, ends):
     """Fills image (H W 3), alpha (H W), depth (H W), and where each tile's list was left, ends (tiles).
 
     lanes: threads, over which neighbouring tiles are dealt out.
     """
-    height, width = alpha.shape
-    across, tiles = (width + TILE - 1) // TILE, len(ends)
+    across, tiles = (alpha.shape[1] + TILE - 1) // TILE, len(ends)
     share = (tiles + lanes - 1) // lanes
     for job in prange(share * lanes):
         tile = (job % share) * lanes + job // share
         if tile < tiles:
-            _blend_tile(tile, starts, splats, rows, background, across, image, alpha, depth, ends)
+            _blend_tile(tile, starts, splats, drawing, background, across, image, alpha, depth, ends)
 
 
 @kernel()
-def _blend_tile(tile, starts, splats, rows, background, across, image, alpha, depth, ends):
+def _blend_tile(tile, starts, splats, drawing, background, across, image, alpha, depth, ends):
     height, width = alpha.shape
     x0, y0 = (tile % across) * TILE, (tile // across) * TILE
     h, w = min(TILE, height - y0), min(TILE, width - x0)
-    state = np.zeros((5, TILE, TILE), np.float32)
-    T, R, G, B, D = state[0], state[1], state[2], state[3], state[4]
-    T[:h, :w] = _ONE
+    M, base = _planes(7)
+    terms = base + _ROWS
+    for y in range(h):
+        for x in range(w):
+            M[base + y * TILE + x] = _ONE
     k, end = starts[tile], starts[tile + 1]
     while k < end:
-        s = rows[splats[k]]
+        s = drawing[splats[k]]
         k += 1
-        gx, gy, a, b, c, o = s[0] - np.float32(x0), s[1] - np.float32(y0), s[2], s[3], s[4], s[5]
+        gx, gy, a = s[0] - np.float32(x0), s[1] - np.float32(y0), s[2]
         r, g, bl, z = s[6], s[7], s[8], s[9]
-        first, last = _pixel_rows(s, x0, y0)
+        _row_terms(M, terms, gy, s)
+        first, last = _pixel_rows(s, -gx, -gy)
         for y in range(first, last):
-            dy = gy - np.float32(y)
-            s0, s1 = -_HALF * c * dy * dy, -b * dy
+            row = base + (y & 15) * TILE
+            constant, linear = M[terms + (y & 15)], M[terms + TILE + (y & 15)]
             for x in range(TILE):
+                j = row + x
                 dx = gx - np.float32(np.int32(x))
-                al = min(o * fast_exp(min(s0 + dx * (s1 - _HALF * a * dx), _ZERO)), _MAX_ALPHA)
-                t = T[y, x]
+                al = fast_exp2(min(max(constant + dx * (linear + a * dx), _LOWEST), _HIGHEST))
+                t = M[j]
                 al = al if al >= _MIN_ALPHA else _ZERO
                 al = al if t > _MIN_T else _ZERO
                 wt = al * t
-                R[y, x] += wt * r
-                G[y, x] += wt * g
-                B[y, x] += wt * bl
-                D[y, x] += wt * z
-                T[y, x] = t - wt
+                M[j + _R] += wt * r
+                M[j + _G] += wt * g
+                M[j + _B] += wt * bl
+                M[j + _D] += wt * z
+                M[j] = t - wt
         if k % _CHECK == 0:
-            most = _ZERO
-            for y in range(TILE):
-                for x in range(TILE):
-                    most = max(most, T[y, x])
-            if most <= _MIN_T:
+            live = np.int32(0)
+            for j in range(base, base + TILE * TILE):
+                live += np.int32(1) if M[j] > _MIN_T else np.int32(0)
+            if live == 0:
                 break
     ends[tile] = k
     for y in range(h):
         for x in range(w):
-            t = T[y, x]
-            image[y0 + y, x0 + x, 0] = R[y, x] + t * background[0]
-            image[y0 + y, x0 + x, 1] = G[y, x] + t * background[1]
-            image[y0 + y, x0 + x, 2] = B[y, x] + t * background[2]
+            j = base + y * TILE + x
+            t = M[j]
+            image[y0 + y, x0 + x, 0] = M[j + _R] + t * background[0]
+            image[y0 + y, x0 + x, 1] = M[j + _G] + t * background[1]
+            image[y0 + y, x0 + x, 2] = M[j + _B] + t * background[2]
             alpha[y0 + y, x0 + x] = _ONE - t
-            depth[y0 + y, x0 + x] = D[y, x] / (_ONE - t) if t < _ONE else _ZERO
+            depth[y0 + y, x0 + x] = M[j + _D] / (_ONE - t) if t < _ONE else _ZERO
 
 
 @kernel(parallel=True)
-def blend_backward(starts, splats, rows, ends, lanes, image, alpha, depth, g_image, g_alpha, g_depth, partials):
+def blend_backward(starts, splats, drawing, ends, lanes, image, alpha, depth, g_image, g_alpha, g_depth, partials):
     """Fills partials (pairs 10) from the gradients of the image, alpha and depth; g_depth may be None."""
-    height, width = alpha.shape
-    across, tiles = (width + TILE - 1) // TILE, len(ends)
+    across, tiles = (alpha.shape[1] + TILE - 1) // TILE, len(ends)
     share = (tiles + lanes - 1) // lanes
     for job in prange(share * lanes):
         tile = (job % share) * lanes + job // share
         if tile < tiles:
-            _unblend_tile(tile, starts, splats, rows, ends, across, image, alpha, depth, g_image, g_alpha, g_depth, partials)
+            _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, depth, g_image, g_alpha, g_depth, partials)
 
 
 @kernel()
-def _unblend_tile(tile, starts, splats, rows, ends, across, image, alpha, depth, g_image, g_alpha, g_depth, partials):
+def _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, depth, g_image, g_alpha, g_depth, partials):
     height, width = alpha.shape
     x0, y0 = (tile % across) * TILE, (tile // across) * TILE
-    h, w = min(TILE, height - y0), min(TILE, width - x0)
-    state = np.zeros((6, TILE, TILE), np.float32)
-    # T: let through so far; S: gradient-weighted colour (less alpha) that is still to come, from here to the background.
-    T, S, GR, GG, GB, GD = state[0], state[1], state[2], state[3], state[4], state[5]
-    sums = np.zeros((7, TILE), np.float32)
-    for y in range(h):
-        for x in range(w):
-            T[y, x] = _ONE
-            i, j = y0 + y, x0 + x
-            GR[y, x], GG[y, x], GB[y, x] = g_image[i, j, 0], g_image[i, j, 1], g_image[i, j, 2]
-            rest = image[i, j, 0] * GR[y, x] + image[i, j, 1] * GG[y, x] + image[i, j, 2] * GB[y, x]
-            S[y, x] = rest - (_ONE - alpha[i, j]) * g_alpha[i, j]
+    M, base = _planes(7)
+    sums, terms = base + _SUMS, base + _ROWS
+    for y in range(min(TILE, height - y0)):
+        for x in range(min(TILE, width - x0)):
+            i, j, m = y0 + y, x0 + x, base + y * TILE + x
+            M[m] = _ONE
+            M[m + _R], M[m + _G], M[m + _B] = g_image[i, j, 0], g_image[i, j, 1], g_image[i, j, 2]
+            rest = image[i, j, 0] * g_image[i, j, 0] + image[i, j, 1] * g_image[i, j, 1] + image[i, j, 2] * g_image[i, j, 2]
+            rest -= (_ONE - alpha[i, j]) * g_alpha[i, j]
             if g_depth is not None and alpha[i, j] > 0:
                 # depth = D / alpha: D is one more channel, and alpha gets -depth / alpha; the sum in S cancels but for T.
-                GD[y, x] = g_depth[i, j] / alpha[i, j]
-                S[y, x] += depth[i, j] * GD[y, x]
+                M[m + _D] = g_depth[i, j] / alpha[i, j]
+                rest += depth[i, j] * M[m + _D]
+            M[m + _S] = rest
     for k in range(starts[tile], ends[tile]):
-        s = rows[splats[k]]
-        gx, gy, a, b, c, o = s[0] - np.float32(x0), s[1] - np.float32(y0), s[2], s[3], s[4], s[5]
+        s = drawing[splats[k]]
+        gx, gy, a = s[0] - np.float32(x0), s[1] - np.float32(y0), s[2]
         r, g, bl, z = s[6], s[7], s[8], s[9]
-        first, last = _pixel_rows(s, x0, y0)
-        sums[:] = _ZERO
+        first, last = _pixel_rows(s, -gx, -gy)
+        _row_terms(M, terms, gy, s)
+        for j in range(sums, sums + 7 * TILE):
+            M[j] = _ZERO
         for y in range(first, last):
-            dy = gy - np.float32(y)
-            s0, s1 = -_HALF * c * dy * dy, -b * dy
+            row = base + (y & 15) * TILE
+            constant, linear = M[terms + (y & 15)], M[terms + TILE + (y & 15)]
+            dy = M[terms + 2 * TILE + (y & 15)]
             for x in range(TILE):
+                j, q = row + x, sums + x
                 dx = gx - np.float32(np.int32(x))
-                raw = o * fast_exp(min(s0 + dx * (s1 - _HALF * a * dx), _ZERO))
-                al = min(raw, _MAX_ALPHA)
-                t = T[y, x]
+                power = max(constant + dx * (linear + a * dx), _LOWEST)
+                al = fast_exp2(min(power, _HIGHEST))
+                t = M[j]
                 al = al if al >= _MIN_ALPHA else _ZERO
                 al = al if t > _MIN_T else _ZERO
                 wt = al * t
-                colour = r * GR[y, x] + g * GG[y, x] + bl * GB[y, x]
+                colour = r * M[j + _R] + g * M[j + _G] + bl * M[j + _B]
                 if g_depth is not None:
-                    colour += z * GD[y, x]
-                rest = S[y, x] - wt * colour
-                S[y, x] = rest
-                T[y, x] = t - wt
+                    colour += z * M[j + _D]
+                rest = M[j + _S] - wt * colour
+                M[j + _S] = rest
+                M[j] = t - wt
                 # Gradient of the exponent; none where alpha is held at its largest.
                 gs = al * (rest / (_ONE - al) - t * colour)
-                gs = gs if raw < _MAX_ALPHA else _ZERO
-                sums[0, x] += gs
-                sums[1, x] += gs * dy
-                sums[2, x] += gs * dy * dy
-                sums[3, x] += wt * GR[y, x]
-                sums[4, x] += wt * GG[y, x]
-                sums[5, x] += wt * GB[y, x]
+                gs = gs if power < _HIGHEST else _ZERO
+                M[q] += gs
+                M[q + 16] += gs * dy
+                M[q + 32] += gs * dy * dy
+                M[q + 48] += wt * M[j + _R]
+                M[q + 64] += wt * M[j + _G]
+                M[q + 80] += wt * M[j + _B]
                 if g_depth is not None:
-                    sums[6, x] += wt * GD[y, x]
-        _write_partials(sums, gx, a, b, c, o, partials[k])
-    partials[ends[tile] : starts[tile + 1]] = _ZERO
+                    M[q + 96] += wt * M[j + _D]
+        _write_partials(M, sums, gx, partials[k])
 
 
 @kernel()
-def _write_partials(sums, gx, a, b, c, o, out):
-    """From sums over a tile's columns to the gradients of one splat; dx and its square are taken per column."""
+def _write_partials(M, sums, gx, out):
+    """From sums over a tile's columns to moments of one splat; dx and its square are the same down a column."""
     g0, gu, gv, guu, guv, gvv = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
     red, green, blue, z = _ZERO, _ZERO, _ZERO, _ZERO
     for x in range(TILE):
         dx = gx - np.float32(np.int32(x))
-        g0 += sums[0, x]
-        gu += sums[0, x] * dx
-        guu += sums[0, x] * dx * dx
-        gv += sums[1, x]
-        guv += sums[1, x] * dx
-        gvv += sums[2, x]
-        red += sums[3, x]
-        green += sums[4, x]
-        blue += sums[5, x]
-        z += sums[6, x]
-    out[0], out[1] = a * gu + b * gv, b * gu + c * gv
-    out[2], out[3], out[4] = _HALF * guu, guv, _HALF * gvv
-    out[5] = -g0 / o
+        g0 += M[sums + x]
+        gu += M[sums + x] * dx
+        guu += M[sums + x] * dx * dx
+        gv += M[sums + 16 + x]
+        guv += M[sums + 16 + x] * dx
+        gvv += M[sums + 32 + x]
+        red += M[sums + 48 + x]
+        green += M[sums + 64 + x]
+        blue += M[sums + 80 + x]
+        z += M[sums + 96 + x]
+    out[0], out[1], out[2], out[3], out[4], out[5] = g0, gu, gv, guu, guv, gvv
     out[6], out[7], out[8], out[9] = red, green, blue, z
 
 
-@kernel(parallel=True)
-def sum_partials(pair_starts, pairs, partials, totals):
-    """Fills totals (N 10) with each splat's sum over its pairs, always in the same order."""
-    for i in prange(len(totals)):
-        for j in range(PARTIALS):
-            totals[i, j] = _ZERO
-        for p in range(pair_starts[i], pair_starts[i + 1]):
+@kernel()
+def sum_partials(starts, ends, splats, partials, conic, opacity):
+    """Gradients of xy (N 2), conic (N 3), opacity (N), rgb (N 3), depth (N), summed tile after tile: always in one order."""
+    n = len(conic)
+    totals = np.zeros((n, PARTIALS), np.float32)
+    for tile in range(len(ends)):
+        for k in range(starts[tile], ends[tile]):
             for j in range(PARTIALS):
-                totals[i, j] += partials[pairs[p], j]
+                totals[splats[k], j] += partials[k, j]
+    g_xy, g_conic, g_opacity = np.empty((n, 2), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    g_rgb, g_depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+    for i in range(n):
+        t = totals[i]
+        g_opacity[i] = -t[0] / max(opacity[i], _TINY)
+        g_xy[i, 0], g_xy[i, 1] = conic[i, 0] * t[1] + conic[i, 1] * t[2], conic[i, 1] * t[1] + conic[i, 2] * t[2]
+        g_conic[i, 0], g_conic[i, 1], g_conic[i, 2] = _HALF * t[3], t[4], _HALF * t[5]
+        g_rgb[i, 0], g_rgb[i, 1], g_rgb[i, 2], g_depth[i] = t[6], t[7], t[8], t[9]
+    return g_xy, g_conic, g_opacity, g_rgb, g_depth

@@ -1,5 +1,7 @@
 """The CPU back end: Numba kernels in float32, held against the reference by tests."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -47,7 +49,7 @@ def _or_zeros(gradient: Tensor | None, *shape: int) -> np.ndarray:
     return np.zeros(shape, np.float32) if gradient is None else _array(gradient)
 
 
-def _tensors(arrays: list[np.ndarray]) -> tuple[Tensor, ...]:
+def _tensors(arrays: Iterable[np.ndarray]) -> tuple[Tensor, ...]:
     return tuple(torch.from_numpy(a) for a in arrays)
 
 
@@ -86,38 +88,35 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, xy, conic, depth, rgb, opacity, extent, background, size):
-        n, (height, width) = len(xy), size
-        z, reach = _array(depth), _array(extent)
-        rows = np.empty((n, bk.ROW), np.float32)
-        bk.pack(_array(xy), _array(conic), _array(opacity), _array(rgb), z, reach, rows)
-        order = np.argsort(z, kind="stable").astype(np.int32)
-        lists = bk.tile_lists(rows, order[reach[order, 0] > 0], width, height)
+        height, width = size
+        z, reached = _array(depth), _array(extent)
+        drawing, reach = bk.pack(_array(xy), _array(conic), _array(opacity), _array(rgb), z, reached)
+        order = bk.depth_order(z, reached)
         image, alpha, expected = (np.empty(shape, np.float32) for shape in ((*size, 3), size, size))
-        ends = np.empty(len(lists[0]) - 1, np.int64)
         with PARALLEL:
             lanes = get_num_threads()
-            bk.blend_forward(*lists[:2], rows, _array(background), lanes, image, alpha, expected, ends)
-        ctx.state = rows, lists, ends, (image, alpha, expected)
-        ctx.background_needs = ctx.needs_input_grad[6]
+            starts, splats = bk.tile_lists(reach, order, width, height, lanes)
+            ends = np.empty(len(starts) - 1, np.int64)
+            bk.blend_forward(starts, splats, drawing, _array(background), lanes, image, alpha, expected, ends)
+        ctx.lists, ctx.splats = (starts, ends, splats), (drawing, _array(conic), _array(opacity))
+        ctx.drawn = image, alpha, expected
         ctx.set_materialize_grads(False)
         return _tensors([image, alpha, expected])
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *gradients):
-        rows, (starts, splats, pair_starts, pairs), ends, drawn = ctx.state
-        size = drawn[1].shape
+        (starts, ends, splats), (drawing, conic, opacity) = ctx.lists, ctx.splats
+        size = ctx.drawn[1].shape
         g_image, g_alpha = _or_zeros(gradients[0], *size, 3), _or_zeros(gradients[1], *size)
         g_depth = None if gradients[2] is None else _array(gradients[2])
-        partials = np.empty((len(pairs), bk.PARTIALS), np.float32)
-        totals = np.empty((len(rows), bk.PARTIALS), np.float32)
+        partials = np.empty((len(splats), bk.PARTIALS), np.float32)
         with PARALLEL:
             lanes = get_num_threads()
-            bk.blend_backward(starts, splats, rows, ends, lanes, *drawn, g_image, g_alpha, g_depth, partials)
-            bk.sum_partials(pair_starts, pairs, partials, totals)
-        g = torch.from_numpy(totals)
+            bk.blend_backward(starts, splats, drawing, ends, lanes, *ctx.drawn, g_image, g_alpha, g_depth, partials)
+        g_xy, g_conic, g_opacity, g_rgb, g_z = _tensors(bk.sum_partials(starts, ends, splats, partials, conic, opacity))
         g_background = None
-        if ctx.background_needs:
-            through = 1 - torch.from_numpy(drawn[1])
+        if ctx.needs_input_grad[6]:
+            through = 1 - torch.from_numpy(ctx.drawn[1])
             g_background = torch.einsum("hwc,hw->c", torch.from_numpy(g_image), through)
-        return g[:, :2], g[:, 2:5], g[:, 9], g[:, 6:9], g[:, 5], None, g_background, None
+        return g_xy, g_conic, g_z, g_rgb, g_opacity, None, g_background, None
