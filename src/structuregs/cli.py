@@ -264,6 +264,9 @@ def main() -> None:
     except KeyboardInterrupt:
         print("interrupted; run the same command to go on", file=sys.stderr)
         sys.exit(130)
+    except BrokenPipeError:  # the reader of a pipe left, as `| head` does; nobody is there to be told
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
     except (ValueError, RuntimeError, OSError) as error:
         if os.environ.get("STRUCTUREGS_DEBUG"):
             raise
