@@ -43,7 +43,7 @@ def load_capture(path: Path | str, *, views: int | None = None, seed: int = 0) -
         capture = Capture(name, root, (tuple(train[0]), tuple(train[1])), (tuple(test[0]), tuple(test[1])), layout)
     for split in (capture.train, capture.test):
         for state, rows in enumerate(split):
-            _check_together(rows, root / STATES[state])
+            _check_together(rows, f"{root}, state {STATES[state]}")
     return capture
 
 
@@ -130,7 +130,7 @@ def _read_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
     return rgba
 
 
-def _check_together(views: tuple[View, ...], where: Path) -> None:
+def _check_together(views: tuple[View, ...], where: str) -> None:
     """What only the views of one state and split together can tell.
 
     Raises:
