@@ -1,0 +1,37 @@
+"""The image loss on the CPU: Numba kernels in float32, held against plain torch by tests."""
+
+import numpy as np
+import torch
+from numba import get_num_threads
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from . import loss_kernels as lk
+from .jit import PARALLEL
+
+
+class ImageLoss(torch.autograd.Function):
+    """See `image_loss`; the gradient is made along with the value."""
+
+    @staticmethod
+    def forward(
+        ctx, rgb: Tensor, alpha: Tensor, target_rgb: Tensor, target_alpha: Tensor, ssim_weight: float, alpha_weight: float
+    ):
+        height, width = alpha.shape
+        arrays = [t.detach().float().contiguous().numpy() for t in (rgb, target_rgb, alpha, target_alpha)]
+        image, target = (a.reshape(height, 3 * width) for a in arrays[:2])
+        weights = np.array([1 - ssim_weight, ssim_weight, alpha_weight]) / [rgb.numel(), rgb.numel(), alpha.numel()]
+        g_image, g_alpha = np.empty_like(image), np.empty_like(arrays[2])
+        parts = np.empty((-(-height // lk.ROWS) * -(-width // lk.COLUMNS), 3))
+        with PARALLEL:
+            lk.loss_and_gradient(
+                image, target, *arrays[2:], weights.astype(np.float32), get_num_threads(), g_image, g_alpha, parts
+            )
+        ctx.save_for_backward(torch.from_numpy(g_image).view(height, width, 3), torch.from_numpy(g_alpha))
+        return torch.tensor(float(parts.sum(0) @ weights), dtype=rgb.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        g_image, g_alpha = ctx.saved_tensors
+        return g_image * gradients[0], g_alpha * gradients[0], None, None, None, None
