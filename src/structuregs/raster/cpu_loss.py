@@ -33,5 +33,6 @@ class ImageLoss(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *gradients):
+        """The gradients of rgb and alpha."""
         g_image, g_alpha = ctx.saved_tensors
         return g_image * gradients[0], g_alpha * gradients[0], None, None, None, None

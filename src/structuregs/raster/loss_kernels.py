@@ -15,7 +15,7 @@ from numba import prange
 
 from .jit import kernel
 
-ROWS, COLUMNS = 64, 128  # of a rectangle, pixels
+ROWS, COLUMNS = 48, 96  # of a rectangle, pixels
 HALF = 5  # of the 11 x 11 window, pixels
 _STEP = 3
 _REACH = HALF * _STEP  # values that the window reaches to each side along a row
@@ -30,13 +30,28 @@ def _absolute(image, target, y0, y1, x0, x1, weight, gradient):
     """Sum of |image - target| in a rectangle; sets the gradient to weight times the sign."""
     total = 0.0
     for y in range(y0, y1):
+        a, b, g = image[y, x0:x1], target[y, x0:x1], gradient[y, x0:x1]
         row = _ZERO
-        for x in range(x0, x1):
-            d = image[y, x] - target[y, x]
+        for x in range(x1 - x0):
+            d = a[x] - b[x]
             row += abs(d)
-            gradient[y, x] = (weight if d > _ZERO else _ZERO) - (weight if d < _ZERO else _ZERO)
+            g[x] = (weight if d > _ZERO else _ZERO) - (weight if d < _ZERO else _ZERO)
         total += row
     return total
+
+
+@kernel()
+def _agree(image, target, y0, y1, x0, x1):
+    """Whether two images are the same in a rectangle, cut to the images."""
+    x0, x1 = max(x0, 0), min(x1, image.shape[1])
+    for y in range(max(y0, 0), min(y1, image.shape[0])):
+        a, b = image[y, x0:x1], target[y, x0:x1]
+        different = np.int32(0)
+        for x in range(x1 - x0):
+            different += np.int32(1) if a[x] != b[x] else np.int32(0)
+        if different > 0:
+            return False
+    return True
 
 
 @kernel()
@@ -45,24 +60,15 @@ def _load(source, y0, x0, rows, columns, out):
     height, width = source.shape
     first, last = max(0, -x0), max(0, min(columns, width - x0))
     for y in range(rows):
+        row = out[y]
+        row[:first] = _ZERO
+        row[last:columns] = _ZERO
         if 0 <= y + y0 < height:
-            out[y, :first] = _ZERO
-            for x in range(first, last):
-                out[y, x] = source[y + y0, x + x0]
-            out[y, last:columns] = _ZERO
+            a, b = source[y + y0, x0 + first : x0 + last], row[first:last]
+            for x in range(last - first):
+                b[x] = a[x]
         else:
-            out[y, :columns] = _ZERO
-
-
-@kernel()
-def _agree(a, b, rows, columns):
-    for y in range(rows):
-        different = np.int32(0)
-        for x in range(columns):
-            different += np.int32(1) if a[y, x] != b[y, x] else np.int32(0)
-        if different > 0:
-            return False
-    return True
+            row[first:last] = _ZERO
 
 
 @kernel()
@@ -83,78 +89,80 @@ def _vertical(a, b, y, n, sums):
 
 
 @kernel()
-def _along(values, q, x):
-    """The window's sum along row q of values, from position x on."""
-    total = _WEIGHTS[HALF] * values[q, x + _REACH]
-    for k in range(HALF):
-        total += _WEIGHTS[k] * (values[q, x + _STEP * k] + values[q, x + _STEP * (2 * HALF - k)])
-    return total
+def _along(source, n, out):
+    """The window's sums along a row, for n places."""
+    for x in range(n):
+        total = _WEIGHTS[HALF] * source[x + _REACH]
+        for k in range(HALF):
+            total += _WEIGHTS[k] * (source[x + _STEP * k] + source[x + _STEP * (2 * HALF - k)])
+        out[x] = total
 
 
 @kernel()
-def _derivatives(sums, first, last, n, out, ssim):
-    """SSIM of a row, and out (3 n): its derivatives by the mean of a, the mean of a^2 + b^2 and the mean of a b.
-
-    Zero outside [first, last), the part of the row on the image.
-    """
+def _down(source, y, n, out):
+    """The window's sums down the columns from row y on, for n places."""
     for x in range(n):
-        ma, mb, mq, mp = _along(sums, 0, x), _along(sums, 1, x), _along(sums, 2, x), _along(sums, 3, x)
+        total = _WEIGHTS[HALF] * source[y + HALF, x]
+        for k in range(HALF):
+            total += _WEIGHTS[k] * (source[y + k, x] + source[y + 2 * HALF - k, x])
+        out[x] = total
+
+
+@kernel()
+def _derivatives(maps, n):
+    """In place: blurred a, b, a^2 + b^2, a b to SSIM's derivatives by the first, third and fourth of them, and SSIM."""
+    for x in range(n):
+        ma, mb, mq, mp = maps[0, x], maps[1, x], maps[2, x], maps[3, x]
         square, product = ma * ma + mb * mb, ma * mb
         a1, a2 = _TWO * product + _C1, _TWO * (mp - product) + _C2
         inverse_1, inverse_2 = _ONE / (square + _C1), _ONE / (mq - square + _C2)
         both = inverse_1 * inverse_2
         s = a1 * a2 * both
-        ssim[x] = s
-        out[0, x] = _TWO * (mb * (a2 - a1) * both - s * ma * (inverse_1 - inverse_2))
-        out[1, x] = -s * inverse_2
-        out[2, x] = _TWO * a1 * both
-    for q in range(3):
-        out[q, :first] = _ZERO
-        out[q, last:n] = _ZERO
+        maps[0, x] = _TWO * (mb * (a2 - a1) * both - s * ma * (inverse_1 - inverse_2))
+        maps[1, x] = -s * inverse_2
+        maps[2, x] = _TWO * a1 * both
+        maps[3, x] = s
 
 
 @kernel()
-def _gradient_row(blurred, y, a, b, n, weight, out):
-    """Adds weight times SSIM's gradient on one row to out."""
+def _add_gradient(maps, a, b, weight, n, out):
     for x in range(n):
-        w = _WEIGHTS[HALF]
-        g0, g1, g2 = w * blurred[y + HALF, 0, x], w * blurred[y + HALF, 1, x], w * blurred[y + HALF, 2, x]
-        for k in range(HALF):
-            w, m = _WEIGHTS[k], 2 * HALF - k
-            g0 += w * (blurred[y + k, 0, x] + blurred[y + m, 0, x])
-            g1 += w * (blurred[y + k, 1, x] + blurred[y + m, 1, x])
-            g2 += w * (blurred[y + k, 2, x] + blurred[y + m, 2, x])
-        out[x] += weight * (g0 + _TWO * a[x] * g1 + b[x] * g2)
+        out[x] += weight * (maps[0, x] + _TWO * a[x] * maps[1, x] + b[x] * maps[2, x])
 
 
 @kernel()
-def _ssim(image, target, y0, y1, x0, x1, weight, gradient, a, b, blurred, sums, row):
+def _ssim(image, target, y0, y1, x0, x1, weight, gradient, a, b, blurred, sums, maps):
     """Sum of 1 - SSIM in a rectangle; adds weight times its gradient.  The last five arguments are scratch memory."""
     height, width = image.shape
     rows, n = y1 - y0, x1 - x0
+    if _agree(image, target, y0 - 2 * HALF, y1 + 2 * HALF, x0 - 2 * _REACH, x1 + 2 * _REACH):
+        return 0.0
     _load(image, y0 - 2 * HALF, x0 - 2 * _REACH, rows + 4 * HALF, n + 4 * _REACH, a)
     _load(target, y0 - 2 * HALF, x0 - 2 * _REACH, rows + 4 * HALF, n + 4 * _REACH, b)
-    if _agree(a, b, rows + 4 * HALF, n + 4 * _REACH):
-        return 0.0
     total = 0.0
     first, last = max(0, _REACH - x0), min(n + 2 * _REACH, width - x0 + _REACH)
     for y in range(rows + 2 * HALF):
         if not 0 <= y + y0 - HALF < height:
-            blurred[y, :, :n] = _ZERO
+            blurred[:, y, :n] = _ZERO
             continue
         _vertical(a, b, y, n + 4 * _REACH, sums)
-        _derivatives(sums, first, last, n + 2 * _REACH, row[:3], row[3])
+        for q in range(4):
+            _along(sums[q], n + 2 * _REACH, maps[q])
+        _derivatives(maps, n + 2 * _REACH)
         if HALF <= y < rows + HALF:
             part = _ZERO
             for x in range(n):
-                part += _ONE - row[3, x + _REACH]
+                part += _ONE - maps[3, x + _REACH]
             total += part
         for q in range(3):
-            for x in range(n):
-                blurred[y, q, x] = _along(row, q, x)
+            maps[q, :first] = _ZERO
+            maps[q, last : n + 2 * _REACH] = _ZERO
+            _along(maps[q], n, blurred[q, y])
     for y in range(rows):
+        for q in range(3):
+            _down(blurred[q], y, n, maps[q])
         a_row, b_row = a[y + 2 * HALF, 2 * _REACH :], b[y + 2 * HALF, 2 * _REACH :]
-        _gradient_row(blurred, y, a_row, b_row, n, -weight, gradient[y + y0, x0:x1])
+        _add_gradient(maps, a_row, b_row, -weight, n, gradient[y + y0, x0:x1])
     return total
 
 
@@ -179,8 +187,8 @@ def loss_and_gradient(image, target, alpha, target_alpha, weights, lanes, g_imag
         n = COLUMNS * _STEP
         a = np.empty((ROWS + 4 * HALF, n + 4 * _REACH), np.float32)
         b = np.empty_like(a)
-        blurred = np.empty((ROWS + 2 * HALF, 3, n), np.float32)
-        sums, row = np.empty((4, n + 4 * _REACH), np.float32), np.empty((4, n + 2 * _REACH), np.float32)
+        blurred = np.empty((3, ROWS + 2 * HALF, n), np.float32)
+        sums, maps = np.empty((4, n + 4 * _REACH), np.float32), np.empty((4, n + 2 * _REACH), np.float32)
         for job in range(lane, len(parts), lanes):
             y0, x0 = job // across * ROWS, job % across * COLUMNS
             y1, x1 = min(y0 + ROWS, height), min(x0 + COLUMNS, width)
@@ -189,5 +197,5 @@ def loss_and_gradient(image, target, alpha, target_alpha, weights, lanes, g_imag
             parts[job, 1] = 0.0
             if weights[1] != 0:
                 parts[job, 1] = _ssim(
-                    image, target, y0, y1, x0 * _STEP, x1 * _STEP, weights[1], g_image, a, b, blurred, sums, row
+                    image, target, y0, y1, x0 * _STEP, x1 * _STEP, weights[1], g_image, a, b, blurred, sums, maps
                 )  # fmt: skip
