@@ -65,7 +65,7 @@ class _Project(torch.autograd.Function):
             pk.project_forward(*arrays, *view, *outputs)
         xy, conic, depth, extent, opacity = _tensors(outputs)
         ctx.inputs, ctx.view = arrays[:3], view[:3]
-        ctx.outputs = outputs[4], outputs[1], outputs[3]
+        ctx.outputs = outputs[4], outputs[3]
         ctx.dtypes = [t.dtype for t in (means, quats, log_scales, logit_opacities)]
         ctx.mark_non_differentiable(extent)
         ctx.set_materialize_grads(False)

@@ -14,9 +14,8 @@ class ImageLoss(torch.autograd.Function):
     """See `image_loss`; the gradient is made along with the value."""
 
     @staticmethod
-    def forward(
-        ctx, rgb: Tensor, alpha: Tensor, target_rgb: Tensor, target_alpha: Tensor, ssim_weight: float, alpha_weight: float
-    ):
+    def forward(ctx, rgb, alpha, target_rgb, target_alpha, ssim_weight, alpha_weight) -> Tensor:
+        """The loss."""
         height, width = alpha.shape
         arrays = [t.detach().float().contiguous().numpy() for t in (rgb, target_rgb, alpha, target_alpha)]
         image, target = (a.reshape(height, 3 * width) for a in arrays[:2])

@@ -3,6 +3,7 @@
 import inspect
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -14,14 +15,14 @@ _FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 PARALLEL = threading.Lock()
 
 
-def kernel(*, parallel: bool = False) -> Callable:
+def kernel(*, parallel: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """A decorator that compiles a function with Numba, cached on disk.
 
     Kernels carry no annotations: their docstrings give shapes.  The test suite's shape checker wraps every function of
     the package; the wrapper is taken off here.
     """
 
-    def compile_function(function: Callable) -> Callable:
+    def compile_function(function: Callable[..., Any]) -> Callable[..., Any]:
         options = {"boundscheck": False, "error_model": "numpy", "cache": True, "fastmath": _FASTMATH}
         return njit(inspect.unwrap(function), parallel=parallel, **options)
 

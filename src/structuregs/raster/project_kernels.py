@@ -43,6 +43,11 @@ def _dot(a, b):
 
 
 @kernel()
+def _cross(a, b):
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@kernel()
 def _camera_point(W, t, means, i):
     p = (means[i, 0], means[i, 1], means[i, 2])
     return _dot(W[0], p) + t[0], _dot(W[1], p) + t[1], _dot(W[2], p) + t[2]
@@ -82,10 +87,8 @@ def _image_row(f, a, u, az):
 def _covariance(m_x, m_y):
     """(xx, xy, yy, determinant) of the dilated 2D covariance; the determinant as a sum of squares, which cannot cancel."""
     xx, xy, yy = _dot(m_x, m_x), _dot(m_x, m_y), _dot(m_y, m_y)
-    c0 = m_x[1] * m_y[2] - m_x[2] * m_y[1]
-    c1 = m_x[2] * m_y[0] - m_x[0] * m_y[2]
-    c2 = m_x[0] * m_y[1] - m_x[1] * m_y[0]
-    det = c0 * c0 + c1 * c1 + c2 * c2 + _DILATION * (xx + yy) + _DILATION * _DILATION
+    normal = _cross(m_x, m_y)
+    det = _dot(normal, normal) + _DILATION * (xx + yy) + _DILATION * _DILATION
     return xx + _DILATION, xy, yy + _DILATION, det
 
 
@@ -142,12 +145,24 @@ def _quat_gradient(w, x, y, z, c0, c1, c2):
 
 
 @kernel()
-def _inverse_gradient(conic, g_conic, i):
-    """Gradient of (xx, xy, yy) of the covariance from that of its inverse K: -K G K, G with half of xy on each side."""
-    A, B, C = conic[i, 0], conic[i, 1], conic[i, 2]
-    gA, gB, gC = g_conic[i, 0], _HALF * g_conic[i, 1], g_conic[i, 2]
-    p, q, r, s = gA * A + gB * B, gA * B + gB * C, gB * A + gC * B, gB * B + gC * C
-    return -(A * p + B * r), -_TWO * (A * q + B * s), -(B * q + C * s)
+def _mix(a, x, b, y, c, z):
+    """The sum of three vectors with weights."""
+    return (a * x[0] + b * y[0] + c * z[0], a * x[1] + b * y[1] + c * z[1], a * x[2] + b * y[2] + c * z[2])
+
+
+@kernel()
+def _row_gradients(m_x, m_y, g_xx, g_xy, g_yy):
+    """Gradients of the image rows from that of the conic (yy, -xy, xx) / det.
+
+    By way of the determinant as a sum of squares: -K G K for the inverse K cancels for thin ellipses.
+    """
+    xx, cross, yy, det = _covariance(m_x, m_y)
+    g_det = -(g_xx * yy - g_xy * cross + g_yy * xx) / (det * det)
+    normal = _cross(m_x, m_y)
+    share, both, turn = _TWO * _DILATION * g_det, -g_xy / det, _TWO * g_det
+    g_mx = _mix(_TWO * g_yy / det + share, m_x, both, m_y, turn, _cross(m_y, normal))
+    g_my = _mix(_TWO * g_xx / det + share, m_y, both, m_x, turn, _cross(normal, m_x))
+    return g_mx, g_my
 
 
 @kernel()
@@ -161,11 +176,9 @@ def _world_column(W, g_x, g_y, g_z):
 
 
 @kernel()
-def _axis_gradient(W, j, f_x, f_y, u, v, m_x, m_y, g_cov):
-    """Gradient of axis j in the world (a column of R S) from that of the covariance."""
-    g_x = f_x * (_TWO * g_cov[0] * m_x[j] + g_cov[1] * m_y[j])
-    g_y = f_y * (_TWO * g_cov[2] * m_y[j] + g_cov[1] * m_x[j])
-    return _world_column(W, g_x, g_y, -(u * g_x + v * g_y))
+def _axis_gradient(W, f_x, f_y, u, v, g_x, g_y):
+    """Gradient of a splat's axis in the world (a column of R S) from those of its entries in the image rows."""
+    return _world_column(W, f_x * g_x, f_y * g_y, -(u * f_x * g_x + v * f_y * g_y))
 
 
 @kernel()
@@ -174,21 +187,19 @@ def _scaled(a, s):
 
 
 @kernel()
-def _centre_gradient(p, lens, m_x, m_y, a_z, g_cov, g_x, g_y, g_depth):
+def _centre_gradient(p, lens, m_x, m_y, a_z, g_mx, g_my, g_x, g_y, g_depth):
     """Gradient of the centre in the camera's frame; g_x, g_y: of the centre on the image."""
     x, y, z = p
     f_x, f_y = lens[0] / z, lens[1] / z
     d_x, d_y = g_x * f_x, g_y * f_y
-    d_z = g_depth - (d_x * x + d_y * y) / z
     # Both image rows go with 1 / z; u and v follow the centre only inside the limits.
-    xx, cross, yy = _dot(m_x, m_x), _dot(m_x, m_y), _dot(m_y, m_y)
-    d_z -= _TWO * (g_cov[0] * xx + g_cov[1] * cross + g_cov[2] * yy) / z
+    d_z = g_depth - (d_x * x + d_y * y) / z - (_dot(m_x, g_mx) + _dot(m_y, g_my)) / z
     if lens[4] <= x / z <= lens[5]:
-        g_u = -f_x * (_TWO * g_cov[0] * _dot(m_x, a_z) + g_cov[1] * _dot(m_y, a_z))
+        g_u = -f_x * _dot(g_mx, a_z)
         d_x += g_u / z
         d_z -= g_u * x / (z * z)
     if lens[6] <= y / z <= lens[7]:
-        g_v = -f_y * (_TWO * g_cov[2] * _dot(m_y, a_z) + g_cov[1] * _dot(m_x, a_z))
+        g_v = -f_y * _dot(g_my, a_z)
         d_y += g_v / z
         d_z -= g_v * y / (z * z)
     return d_x, d_y, d_z
@@ -196,7 +207,7 @@ def _centre_gradient(p, lens, m_x, m_y, a_z, g_cov, g_x, g_y, g_depth):
 
 @kernel(parallel=True)
 def project_backward(
-    means, quats, log_scales, W, t, lens, opacity, conic, extent, g_xy, g_conic, g_depth, g_opacity,
+    means, quats, log_scales, W, t, lens, opacity, extent, g_xy, g_conic, g_depth, g_opacity,
     d_means, d_quats, d_log_scales, d_logits,
 ):  # fmt: skip
     """Fills the gradients d_* of the splats' tensors from the gradients g_* of the projection; 0 for splats not drawn."""
@@ -212,14 +223,14 @@ def project_backward(
         u, v = min(max(p[0] / p[2], lens[4]), lens[5]), min(max(p[1] / p[2], lens[6]), lens[7])
         f_x, f_y = lens[0] / p[2], lens[1] / p[2]
         m_x, m_y = _image_row(f_x, a_x, u, a_z), _image_row(f_y, a_y, v, a_z)
-        g_cov = _inverse_gradient(conic, g_conic, i)
+        g_mx, g_my = _row_gradients(m_x, m_y, g_conic[i, 0], g_conic[i, 1], g_conic[i, 2])
 
-        d = _centre_gradient(p, lens, m_x, m_y, a_z, g_cov, g_xy[i, 0], g_xy[i, 1], g_depth[i])
+        d = _centre_gradient(p, lens, m_x, m_y, a_z, g_mx, g_my, g_xy[i, 0], g_xy[i, 1], g_depth[i])
         d_means[i, 0], d_means[i, 1], d_means[i, 2] = _world_column(W, d[0], d[1], d[2])
 
-        c0 = _scaled(_axis_gradient(W, 0, f_x, f_y, u, v, m_x, m_y, g_cov), s[0])
-        c1 = _scaled(_axis_gradient(W, 1, f_x, f_y, u, v, m_x, m_y, g_cov), s[1])
-        c2 = _scaled(_axis_gradient(W, 2, f_x, f_y, u, v, m_x, m_y, g_cov), s[2])
+        c0 = _scaled(_axis_gradient(W, f_x, f_y, u, v, g_mx[0], g_my[0]), s[0])
+        c1 = _scaled(_axis_gradient(W, f_x, f_y, u, v, g_mx[1], g_my[1]), s[1])
+        c2 = _scaled(_axis_gradient(W, f_x, f_y, u, v, g_mx[2], g_my[2]), s[2])
         d_log_scales[i, 0] = c0[0] * R[0][0] + c0[1] * R[1][0] + c0[2] * R[2][0]
         d_log_scales[i, 1] = c1[0] * R[0][1] + c1[1] * R[1][1] + c1[2] * R[2][1]
         d_log_scales[i, 2] = c2[0] * R[0][2] + c2[1] * R[1][2] + c2[2] * R[2][2]
