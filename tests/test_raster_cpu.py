@@ -1,5 +1,7 @@
 """The Numba renderer against the reference, in values and gradients."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numba
 import numpy as np
 import pytest
@@ -176,3 +178,21 @@ def test_double_input_is_drawn_in_single_and_gets_double_gradients():
 def test_the_polynomial_is_two_to_the_x():
     x = np.linspace(-8, 0, 2001).astype(np.float32)
     np.testing.assert_allclose([fast_exp2(v) for v in x], np.exp2(x.astype(np.float64)), rtol=6e-7)
+
+
+def test_threads_may_render_at_once():
+    splats, camera = make_splats(200), make_camera(60, 60)
+    expected = render(splats, camera).rgb
+    with ThreadPoolExecutor(4) as pool:
+        images = list(pool.map(lambda _: render(splats, camera).rgb, range(40)))
+    assert all(torch.equal(image, expected) for image in images)
+
+
+def test_changing_an_image_in_place_before_the_backward_pass_is_refused():
+    tensors = {name: value.requires_grad_() for name, value in make_splats(5).tensors().items()}
+    image = render(Splats(**tensors), make_camera(10, 10))
+    loss = image.rgb.sum()
+    with torch.no_grad():
+        image.rgb.clamp_(0, 0.5)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()

@@ -64,9 +64,8 @@ class _Project(torch.autograd.Function):
         with PARALLEL:
             pk.project_forward(*arrays, *view, *outputs)
         xy, conic, depth, extent, opacity = _tensors(outputs)
-        ctx.inputs, ctx.view = arrays[:3], view[:3]
-        ctx.outputs = outputs[4], outputs[3]
-        ctx.dtypes = [t.dtype for t in (means, quats, log_scales, logit_opacities)]
+        ctx.save_for_backward(means, quats, log_scales, opacity, extent)
+        ctx.view, ctx.logit_dtype = view[:3], logit_opacities.dtype
         ctx.mark_non_differentiable(extent)
         ctx.set_materialize_grads(False)
         return xy, conic, depth, extent, opacity
@@ -75,12 +74,14 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, *gradients):
         g_xy, g_conic, g_depth, _, g_opacity = gradients
-        n = len(ctx.inputs[0])
+        *inputs, opacity, extent = ctx.saved_tensors
+        n = len(opacity)
         incoming = _or_zeros(g_xy, n, 2), _or_zeros(g_conic, n, 3), _or_zeros(g_depth, n), _or_zeros(g_opacity, n)
         outgoing = [np.empty(shape, np.float32) for shape in ((n, 3), (n, 4), (n, 3), n)]
         with PARALLEL:
-            pk.project_backward(*ctx.inputs, *ctx.view, *ctx.outputs, *incoming, *outgoing)
-        return *(t.to(dtype) for t, dtype in zip(_tensors(outgoing), ctx.dtypes, strict=True)), None
+            pk.project_backward(*map(_array, inputs), *ctx.view, _array(opacity), _array(extent), *incoming, *outgoing)
+        dtypes = [*(t.dtype for t in inputs), ctx.logit_dtype]
+        return *(t.to(dtype) for t, dtype in zip(_tensors(outgoing), dtypes, strict=True)), None
 
 
 class _Blend(torch.autograd.Function):
@@ -92,31 +93,33 @@ class _Blend(torch.autograd.Function):
         z, reached = _array(depth), _array(extent)
         drawing, reach = bk.pack(_array(xy), _array(conic), _array(opacity), _array(rgb), z, reached)
         order = bk.depth_order(z, reached)
-        image, alpha, expected = (np.empty(shape, np.float32) for shape in ((*size, 3), size, size))
+        drawn = [np.empty(shape, np.float32) for shape in ((*size, 3), size, size)]
         with PARALLEL:
             lanes = get_num_threads()
             starts, splats = bk.tile_lists(reach, order, width, height, lanes)
             ends = np.empty(len(starts) - 1, np.int64)
-            bk.blend_forward(starts, splats, drawing, _array(background), lanes, image, alpha, expected, ends)
-        ctx.lists, ctx.splats = (starts, ends, splats), (drawing, _array(conic), _array(opacity))
-        ctx.drawn = image, alpha, expected
+            bk.blend_forward(starts, splats, drawing, _array(background), lanes, *drawn, ends)
+        outputs = _tensors(drawn)
+        ctx.save_for_backward(conic, opacity, *outputs)
+        ctx.lists, ctx.drawing = (starts, ends, splats), drawing
         ctx.set_materialize_grads(False)
-        return _tensors([image, alpha, expected])
+        return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *gradients):
-        (starts, ends, splats), (drawing, conic, opacity) = ctx.lists, ctx.splats
-        size = ctx.drawn[1].shape
+        starts, ends, splats = ctx.lists
+        conic, opacity, *drawn = map(_array, ctx.saved_tensors)
+        size = drawn[1].shape
         g_image, g_alpha = _or_zeros(gradients[0], *size, 3), _or_zeros(gradients[1], *size)
         g_depth = None if gradients[2] is None else _array(gradients[2])
         partials = np.empty((len(splats), bk.PARTIALS), np.float32)
         with PARALLEL:
             lanes = get_num_threads()
-            bk.blend_backward(starts, splats, drawing, ends, lanes, *ctx.drawn, g_image, g_alpha, g_depth, partials)
+            bk.blend_backward(starts, splats, ctx.drawing, ends, lanes, *drawn, g_image, g_alpha, g_depth, partials)
         g_xy, g_conic, g_opacity, g_rgb, g_z = _tensors(bk.sum_partials(starts, ends, splats, partials, conic, opacity))
         g_background = None
         if ctx.needs_input_grad[6]:
-            through = 1 - torch.from_numpy(ctx.drawn[1])
+            through = 1 - torch.from_numpy(drawn[1])
             g_background = torch.einsum("hwc,hw->c", torch.from_numpy(g_image), through)
         return g_xy, g_conic, g_z, g_rgb, g_opacity, None, g_background, None
