@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from .fit.schedule import PRESETS, Preset
-
 if TYPE_CHECKING:
     from .capture import TrueJoint
     from .evaluate import JointScore, Report
@@ -19,6 +17,7 @@ if TYPE_CHECKING:
 
 # Packages that cost a second or more to import are imported in the commands: `--help` must not wait for them.
 
+Preset = Literal["fast", "default", "paper"]
 CaptureFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")]
 RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
 NewRun = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="RUN")]
@@ -143,6 +142,7 @@ def _fit(
     from .capture import load_capture
     from .export import write_structure
     from .fit.reconstruct import fit_run
+    from .fit.schedule import PRESETS
 
     photos = load_capture(capture, views=views, seed=seed)
     events = fit_run(photos, run, PRESETS[preset], device=device, parts=parts, points=points, seed=seed)

@@ -1,1 +1,20 @@
 """Clouds to boxes matched across states, with hypotheses for their motions."""
+
+from .cue import Cluster, CueConfig, StateLook, box_around, clusters
+from .partition import MovingPart, SearchConfig
+from .survey import StartConfig, boxes_at_rest, boxes_of_parts, find_parts, survey
+
+__all__ = [
+    "Cluster",
+    "CueConfig",
+    "MovingPart",
+    "SearchConfig",
+    "StartConfig",
+    "StateLook",
+    "box_around",
+    "boxes_at_rest",
+    "boxes_of_parts",
+    "clusters",
+    "find_parts",
+    "survey",
+]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy import ndimage
 from torch import Tensor
 
@@ -19,8 +19,8 @@ class AppearanceConfig:
     """The short fit of one state by itself."""
 
     size: int = 128
-    """Longer side of the images, pixels."""
-    steps: int = 350
+    """Side of a square with as many pixels as the images, which are cropped to the object."""
+    steps: int = 450
     """Optimiser steps, one view each."""
     splats: int = 10_000
     """Splats at the start."""
@@ -83,9 +83,8 @@ def surface_points(splats: Splats, stack: ImageStack, hull: Hull, looks: int) ->
         picture = render(splats, stack.cameras[v])
         origin, rays = stack.cameras[v].rays()
         # Where depth jumps from one pixel to the next, its mean lies in the air between.
-        depth = picture.depth
-        flat = (_spread(depth) < 2.5 * hull.voxel) & (picture.alpha > 0.8)
-        hits.append((origin + rays * depth[..., None])[flat])
+        clear = (_bend(picture.depth) < 1.5 * hull.voxel) & (picture.alpha > 0.8)
+        hits.append((origin + rays * picture.depth[..., None])[clear])
     points = torch.cat(hits).double().numpy()
     cells = np.floor((points - hull.origin) / hull.voxel).astype(np.int64)
     held = ((cells >= 0) & (cells < hull.occupied.shape)).all(1)
@@ -96,11 +95,9 @@ def surface_points(splats: Splats, stack: ImageStack, hull: Hull, looks: int) ->
     return (sums / count[:, None])[count >= 2]
 
 
-def _spread(depth: Tensor) -> Tensor:
-    """Largest minus smallest depth over each pixel's 3 x 3 neighbourhood."""
-    padded = torch.nn.functional.pad(depth[None, None], (1, 1, 1, 1), mode="replicate")
-    high = torch.nn.functional.max_pool2d(padded, 3, 1)
-    low = -torch.nn.functional.max_pool2d(-padded, 3, 1)
-    return (high - low)[0, 0]
-
-
+def _bend(depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """How far each pixel's depth lies from the middle of its neighbours', the larger of both directions; slopes have none."""
+    padded = torch.nn.functional.pad(depth[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    across = (padded[1:-1, :-2] + padded[1:-1, 2:]) / 2 - depth
+    down = (padded[:-2, 1:-1] + padded[2:, 1:-1]) / 2 - depth
+    return torch.maximum(across.abs(), down.abs())

@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 from sklearn.cluster import DBSCAN
 
+from ..capture import ImageStack
 from ..geometry import Box
+from ..model import Splats
 from ..points import Hull
 
 
@@ -28,6 +30,23 @@ class CueConfig:
 
 
 @dataclass(frozen=True)
+class StateLook:
+    """What is known of one state by itself.
+
+    Attributes:
+        stack: its photos at a small size.
+        hull: its visual hull.
+        points: its surface, in the world.
+        splats: its quick look, in the world.
+    """
+
+    stack: ImageStack
+    hull: Hull
+    points: Float64[np.ndarray, "P 3"]
+    splats: Splats
+
+
+@dataclass(frozen=True)
 class Cluster:
     """Points that are in one state and not in the other: a moving part, several, or a piece of one.
 
@@ -40,34 +59,31 @@ class Cluster:
     points: Float64[np.ndarray, "P 3"]
 
 
-def moving_points(
-    points: Float64[np.ndarray, "P 3"], other: Hull, other_points: Float64[np.ndarray, "Q 3"], threshold: float
-) -> Bool[np.ndarray, " P"]:
-    """Points farther than `threshold` (world units) from anything that the other state may hold there.
+def moving_points(points: Float64[np.ndarray, "P 3"], other: StateLook, threshold: float) -> Bool[np.ndarray, " P"]:
+    """Points farther than `threshold` (world units) from any surface of the other state, and from its visual hull.
 
-    That is eq. 1 of the supplement against the other state's points, and against its solid hull, so that a surface which
-    merely came to light (the inside of an open drawer's cabinet) is no motion.
+    The distance alone (eq. 1 of the supplement) also finds surfaces that merely came to light, such as the inside of an
+    opened cabinet; the masks must say that the other state has nothing there.
     """
-    solid = other.sample(other.distance(), points, outside=np.inf)
-    nearest = cKDTree(other_points).query(points, distance_upper_bound=2 * threshold)[0] if len(other_points) else solid
-    return (solid > threshold) & (nearest > threshold)
+    carved = other.hull.sample(other.hull.distance(), points, outside=np.inf) > threshold
+    if not len(other.points):
+        return carved
+    return carved & (cKDTree(other.points).query(points, distance_upper_bound=2 * threshold)[0] > threshold)
 
 
-def clusters(
-    points: tuple[Float64[np.ndarray, "P 3"], Float64[np.ndarray, "Q 3"]], hulls: tuple[Hull, Hull], config: CueConfig
-) -> list[Cluster]:
+def clusters(looks: tuple[StateLook, StateLook], config: CueConfig) -> list[Cluster]:
     """Clusters of departed (state 0) and arrived (state 1) points, the largest first."""
     found = []
-    for state in (0, 1):
-        other = 1 - state
-        voxel = hulls[other].voxel
-        moving = points[state][moving_points(points[state], hulls[other], points[other], config.threshold * voxel)]
+    for state, look in enumerate(looks):
+        other = looks[1 - state]
+        voxel = other.hull.voxel
+        moving = look.points[moving_points(look.points, other, config.threshold * voxel)]
         if len(moving) < config.neighbours:
             continue
         labels = DBSCAN(eps=config.link * voxel, min_samples=config.neighbours).fit_predict(moving)
         for label in range(labels.max() + 1):
             members = moving[labels == label]
-            if len(members) >= max(config.smallest * len(points[state]), 2 * config.neighbours):
+            if len(members) >= max(config.smallest * len(look.points), 2 * config.neighbours):
                 found.append(Cluster(state, members))
     return sorted(found, key=lambda cluster: -len(cluster.points))
 

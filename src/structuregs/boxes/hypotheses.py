@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from ..geometry import SE3, Box, Screw
+from ..geometry import SE3, Box, Screw, screw_of_motion
 from ..points import Hull
 
 _ANGLES = torch.deg2rad(torch.tensor([8.0, *range(15, 181, 15)], dtype=torch.float64))
@@ -28,13 +28,23 @@ class Hypothesis:
         motion: of the world, float64.
         outside: mean depth by which the moved points leave the other state's solid, in voxels.
         unexplained: fraction of the other state's moving points near the motion's reach that it leaves uncovered.
+        oddity: how unlike a joint's the motion is (see `oddity`).
         image_error: mean absolute error of the other state's photos with the part moved so; infinite until looked at.
     """
 
     motion: SE3
     outside: float
     unexplained: float
+    oddity: float
     image_error: float = float("inf")
+
+    def cost(self, gain: float) -> float:
+        """What hypotheses are compared by: the image error, raised where the motion leaves the hull or is unlike a joint's.
+
+        Light that stays in the world while a part turns can make a mirrored pose look better than the true one; therefore
+        what is odd about a motion counts as a share of `gain`, the most that any hypothesis takes off the error.
+        """
+        return self.image_error + gain * (0.2 * self.oddity + 0.2 * min(self.outside, 1.0))
 
 
 def hinge_screws(box: Box) -> list[Screw]:
@@ -108,21 +118,51 @@ def hull_scores(
     return outside, 1 - box.contains(back, margin=2 * other.voxel).double().mean(1).numpy()
 
 
-def displacement(a: SE3, b: SE3, box: Box) -> float:
-    """Root mean square distance between a box's corners moved by two motions, relative to its half diagonal."""
-    gap = a.apply(box.corners) - b.apply(box.corners)
-    return float(gap.square().sum(-1).mean().sqrt() / box.half_extents.norm())
+def oddity(motion: SE3, box: Box) -> float:
+    """How unlike a joint's a motion is: 0 for a short slide, or a turn about an axis at the box, and without a slide along it.
+
+    The sum of three lengths over the box's half diagonal: the gap between the axis and the box and the slide along the
+    axis, each counted up to 1 and only for turns, and the travel of the corners: of two that look alike, the shorter way.
+
+    Args:
+        motion: of the box, in the world, float64.
+        box: where the part is before the motion.
+    """
+    size = float(box.half_extents.norm())
+    centre = box.T_world_box.xyz
+    travel = float((motion.apply(box.corners) - box.corners).square().sum(-1).mean().sqrt())
+    total = travel / size
+    if float(motion.angle) > np.deg2rad(5):
+        at_centre = SE3.from_quat(motion.wxyz, motion.apply(centre) - centre)
+        screw, _ = screw_of_motion(at_centre, "revolute")
+        line = torch.linspace(-2, 2, 41, dtype=torch.float64)[:, None] * size * screw.axis + screw.origin + centre
+        local = box.T_world_box.inverse().apply(line).abs() - box.half_extents
+        gap = float(local.clamp(min=0).norm(dim=-1).amin())
+        slide = abs(float(screw.axis @ at_centre.xyz))
+        total += min(gap / size, 1.0) + min(slide / size, 1.0)
+    return total
 
 
-def distinct(hypotheses: list[Hypothesis], box: Box, gap: float, most: int) -> list[Hypothesis]:
-    """The first `most` hypotheses, in the order given, of which no two are closer than `gap` (see `displacement`)."""
-    kept: list[Hypothesis] = []
-    for hypothesis in hypotheses:
-        if all(displacement(hypothesis.motion, other.motion, box) > gap for other in kept):
-            kept.append(hypothesis)
-            if len(kept) == most:
-                break
+def displacements(motions: SE3, one: SE3, box: Box) -> Float64[np.ndarray, " M"]:
+    """Root mean square distance of a box's corners moved by each of M motions and by one, over its half diagonal."""
+    gap = motions[:, None].apply(box.corners) - one.apply(box.corners)
+    return (gap.square().sum(-1).mean(-1).sqrt() / box.half_extents.norm()).numpy()
+
+
+def distinct(motions: SE3, box: Box, gap: float, most: int) -> list[int]:
+    """Indices of the first `most` motions, in the order given, no two of which are closer than `gap` (see `displacements`)."""
+    kept: list[int] = []
+    near = np.zeros(len(motions.wxyz_xyz), bool)
+    for index in range(len(near)):
+        if not near[index] and len(kept) < most:
+            kept.append(index)
+            near |= displacements(motions, motions[index], box) < gap
     return kept
+
+
+def stack_motions(hypotheses: list[Hypothesis]) -> SE3:
+    """Their motions as one batch."""
+    return SE3(torch.stack([hypothesis.motion.wxyz_xyz for hypothesis in hypotheses]))
 
 
 def turn_about(centre: Float[Tensor, " 3"], tangent: Float[Tensor, " 6"]) -> SE3:

@@ -4,58 +4,56 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Int64
+from torch import Tensor
 
-from ..capture import ImageStack
 from ..geometry import SE3, Box
 from ..model import Splats
-from ..points import Hull
 from ..raster import image_loss, render
-from .hypotheses import Hypothesis, turn_about
+from .cue import StateLook
+from .hypotheses import Hypothesis, oddity, turn_about
 
 
 @dataclass(frozen=True)
-class StateLook:
-    """What is known of one state by itself.
+class Scene:
+    """One state's photos, and everything but one part as it stands in them.
 
     Attributes:
-        stack: its photos at a small size.
-        hull: its visual hull.
-        points: its surface, in the world.
-        splats: its quick look, in the world.
+        look: the photos' state.
+        rest: splats of all the rest, in the world.
+        views: which photos judge; the first few of them do for a quick look.
     """
 
-    stack: ImageStack
-    hull: Hull
-    points: Float64[np.ndarray, "P 3"]
-    splats: Splats
+    look: StateLook
+    rest: Splats
+    views: Int64[np.ndarray, " L"]
+
+    def loss(self, part: Splats | None, v: int) -> Float[Tensor, ""]:
+        """Error of one photo with the part where it is, or without it."""
+        stack = self.look.stack
+        rgb, alpha = stack.target(v)
+        picture = render(self.rest if part is None else Splats.concatenate([self.rest, part]), stack.cameras[v])
+        return image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=0.5)
+
+    @torch.no_grad()
+    def error(self, part: Splats | None, motion: SE3, quick: bool = False) -> float:
+        """Mean error of the judging photos with the part moved."""
+        moved = None if part is None else part.moved(motion)
+        return float(np.mean([float(self.loss(moved, int(v))) for v in self.views[:: 2 if quick else 1]]))
+
+    def judge(self, hypothesis: Hypothesis, part: Splats, quick: bool = False) -> Hypothesis:
+        """The hypothesis with its image error."""
+        return replace(hypothesis, image_error=self.error(part, hypothesis.motion, quick))
 
 
-def _photo_error(scene: Splats, stack: ImageStack, v: int) -> torch.Tensor:
-    rgb, alpha = stack.target(v)
-    picture = render(scene, stack.cameras[v])
-    return image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=0.5)
-
-
-@torch.no_grad()
-def photo_error(rest: Splats, part: Splats, motion: SE3, stack: ImageStack, views: np.ndarray) -> float:
-    """Mean error of the photos `views` against the rest with the part moved by `motion`."""
-    scene = Splats.concatenate([rest, part.moved(motion)])
-    return float(np.mean([float(_photo_error(scene, stack, v)) for v in views]))
-
-
-def refine(
-    hypothesis: Hypothesis, rest: Splats, part: Splats, box: Box, stack: ImageStack, views: np.ndarray, steps: int, rate: float
-) -> Hypothesis:
+def refine(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, steps: int, rate: float) -> Hypothesis:
     """The hypothesis after the photos have pulled its motion into place, with its new image error.
 
     Args:
         hypothesis: the motion to start from, from the part's state to the photos'.
-        rest: everything else, as it stands in the photos' state.
+        scene: the photos, and the rest.
         part: the part's splats in its own state.
         box: the part's box in its own state; turns are about its moved centre, and `rate` counts in its half diagonal.
-        stack: photos of the other state.
-        views: which of them to use, for steps in turn and for the final error.
         steps: optimiser steps, one photo each.
         rate: of the tangent at the start; falls to a tenth.
     """
@@ -65,17 +63,13 @@ def refine(
     unit = torch.tensor([reach] * 3 + [1.0] * 3)
     tangent = torch.zeros(6, requires_grad=True)
     optimiser = torch.optim.Adam([tangent], lr=rate, betas=(0.8, 0.95))
-    best, best_error = hypothesis.motion, photo_error(rest, part, hypothesis.motion, stack, views)
     for step in range(steps):
         optimiser.param_groups[0]["lr"] = rate * 0.1 ** (step / steps)
         motion = turn_about(centre, tangent * unit) @ start
-        scene = Splats.concatenate([rest, part.moved(motion)])
-        loss = _photo_error(scene, stack, int(views[step % len(views)]))
+        loss = scene.loss(part.moved(motion), int(scene.views[step % len(scene.views)]))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     motion = (turn_about(centre, (tangent * unit).detach()) @ start).to(dtype=torch.float64)
-    error = photo_error(rest, part, motion, stack, views)
-    if error < best_error:
-        best, best_error = motion, error
-    return replace(hypothesis, motion=best, image_error=best_error)
+    moved = replace(hypothesis, motion=motion, oddity=oddity(motion, box))
+    return min(scene.judge(hypothesis, part), scene.judge(moved, part), key=lambda h: h.image_error)

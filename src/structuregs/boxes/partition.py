@@ -1,6 +1,5 @@
 """From clusters of what moved to moving parts: each a box in state 0 and the motion that the photos like best."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,9 +8,9 @@ from jaxtyping import Float64
 
 from ..geometry import SE3, Box
 from ..model import Splats
-from .cue import Cluster, CueConfig, box_around, clusters
-from .hypotheses import Hypothesis, candidate_motions, displacement, distinct, hull_scores
-from .judge import StateLook, photo_error, refine
+from .cue import CueConfig, StateLook, box_around, clusters
+from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, hull_scores, oddity, stack_motions
+from .judge import Scene, refine
 
 
 @dataclass(frozen=True)
@@ -20,17 +19,23 @@ class SearchConfig:
 
     cue: CueConfig = field(default_factory=CueConfig)
     """The motion cue."""
-    shortlist: int = 150
+    most: int = 12
+    """Clusters that are looked at, the largest first."""
+    shortlist: int = 60
     """Hypotheses per cluster that pass the hull and are shown to the photos."""
-    finalists: int = 6
+    finalists: int = 5
     """Distinct hypotheses per cluster that the photos pull into place."""
     looks: int = 8
     """Photos of the other state that judge the shortlist."""
-    steps: int = 48
+    steps: int = 40
     """Optimiser steps for each finalist."""
     rate: float = 0.03
     """Of a finalist's pose: radians, and parts of the box's half diagonal."""
-    worth: float = 0.01
+    same: float = 0.25
+    """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
+    alike: float = 0.75
+    """...and if moving it like the other takes this fraction of the best gain off the photo error."""
+    worth: float = 0.002
     """A part is kept if it takes at least this fraction off the other state's photo error."""
 
 
@@ -42,12 +47,14 @@ class MovingPart:
         state: the state whose cluster it was found by.
         points: of its surface, in that state, in the world.
         hypothesis: its motion from `state` to the other state.
+        gain: fraction that it takes off the error of the other state's photos.
         rivals: what the photos thought of the next best distinct motions.
     """
 
     state: int
     points: Float64[np.ndarray, "P 3"]
     hypothesis: Hypothesis
+    gain: float
     rivals: tuple[Hypothesis, ...] = ()
 
     @property
@@ -69,7 +76,7 @@ class PartSearch:
         self.config = config
         self.generator = np.random.default_rng(seed)
         self.voxel = looks[0].hull.voxel
-        self.clusters = clusters((looks[0].points, looks[1].points), (looks[0].hull, looks[1].hull), config.cue)
+        self.clusters = clusters(looks, config.cue)[: config.most]
         self.boxes = [self._box(cluster.points) for cluster in self.clusters]
         self.base_box = self._box(self._still_points())
 
@@ -97,64 +104,131 @@ class PartSearch:
         count = len(self.looks[state].stack)
         return np.unique(np.linspace(0, count - 1, min(self.config.looks, count)).round().astype(int))
 
-    def search(self, note: Callable[[str], None]) -> list[MovingPart]:
-        """All moving parts, with the motions that the photos prefer; unsorted and not yet merged."""
+    def search(self, count: int | None) -> list[MovingPart]:
+        """The moving parts with the motions that the photos prefer: all that are worth it, or the `count` best."""
         parts: list[MovingPart] = []
         explained: set[int] = set()
-        for index, cluster in enumerate(self.clusters):
+        for index in range(len(self.clusters)):
             if index in explained:
                 continue
-            part, gain = self._try(cluster, self.boxes[index], parts, explained)
-            if gain < self.config.worth:
+            part, members = self._try(index, parts, explained)
+            if part.gain < self.config.worth:
                 continue
             parts.append(part)
-            explained |= self._explained_by(part, self.boxes[index])
-            note(f"cluster of {len(cluster.points)} points in state {cluster.state}: photo error {part.hypothesis.image_error:.4f}")
+            explained |= members | self._explained_by(part)
+        parts = self._reconsider(parts) if len(parts) > 1 else parts
+        return sorted(parts, key=lambda part: -part.gain)[:count]
+
+    def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
+        """Looks at each part again with all others in place; one that may as well move like another becomes one with it."""
+        parts = list(parts)
+        index = 0
+        while index < len(parts):
+            part, others = parts[index], parts[:index] + parts[index + 1 :]
+            state, other = part.state, 1 - part.state
+            box = self._box(part.points)
+            scene = Scene(self.looks[other], self._rest(others, state, other), self._judges(other))
+            absent = scene.error(None, SE3.identity(dtype=torch.float64))
+            splats = self.looks[state].splats
+            piece = splats[self._inside(splats, [box])]
+            shared = [p.motion if state == 0 else p.motion.inverse() for p in others]
+            starts = [part.hypothesis, *part.rivals[:2], *(Hypothesis(T, 0.0, 0.0, oddity(T, box)) for T in shared)]
+            again = [refine(h, scene, piece, box, self.config.steps, self.config.rate) for h in starts]
+            gains = [absent - h.image_error for h in again]
+            most = max(*gains, 1e-12)
+            by_cost = sorted(again, key=lambda h: h.cost(most))
+            gaps = displacements(SE3(torch.stack([T.wxyz_xyz for T in shared])), by_cost[0].motion, box)
+            likeness = np.where(gaps < self.config.same, np.array(gains[-len(shared) :]) / most, 0.0)
+            twin = int(np.argmax(likeness))
+            if likeness[twin] > self.config.alike:
+                parts = self._merged(others[twin], part, [p for p in others if p is not others[twin]])
+                index = 0
+                if len(parts) == 1:
+                    break
+                continue
+            again = by_cost
+            chosen = distinct(stack_motions(again), box, 0.1, len(again))
+            parts[index] = replace(part, hypothesis=again[0], rivals=tuple(again[c] for c in chosen[1:]))
+            index += 1
         return parts
 
-    def _explained_by(self, part: MovingPart, box: Box) -> set[int]:
-        """Clusters of the other state that lie where the part has moved to."""
-        landed = box.moved(part.hypothesis.motion)
+    def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
+        """The parts with two of them made one, which moves as the leader does."""
+        there = follower.points if follower.state == leader.state else leader.hypothesis.motion.inverse().apply(
+            torch.from_numpy(follower.points)
+        ).numpy()
+        return [replace(leader, points=np.concatenate([leader.points, there])), *rest]
+
+    def _explained_by(self, part: MovingPart) -> set[int]:
+        """Clusters of either state that lie where the part is in that state."""
+        box = self._box(part.points)
         found = set()
         for index, cluster in enumerate(self.clusters):
-            if cluster.state != part.state:
-                inside = landed.contains(torch.from_numpy(cluster.points), margin=3 * self.voxel)
-                if float(inside.double().mean()) > 0.6:
-                    found.add(index)
+            there = box if cluster.state == part.state else box.moved(part.hypothesis.motion)
+            if float(there.contains(torch.from_numpy(cluster.points), margin=3 * self.voxel).double().mean()) > 0.6:
+                found.add(index)
         return found
 
-    def _try(self, cluster: Cluster, box: Box, parts: list[MovingPart], explained: set[int]) -> tuple[MovingPart, float]:
-        """The best motion of one cluster, and the fraction of the photo error that it saves against leaving it out."""
-        state, other = cluster.state, 1 - cluster.state
-        own, target = self.looks[state], self.looks[other]
-        rivals = [
-            (c, b) for i, (c, b) in enumerate(zip(self.clusters, self.boxes, strict=True)) if c.state == other and i not in explained
-        ]
-        motions = candidate_motions(box, self.base_box, [b for _, b in rivals])
-        sample = self._sample(cluster.points, 300)
-        arrivals = self._sample(np.concatenate([c.points for c, _ in rivals]), 300) if rivals else np.zeros((0, 3))
-        outside, unexplained = hull_scores(motions, sample, target.hull, arrivals, box)
-        ranked = np.argsort(outside + unexplained, kind="stable")[: self.config.shortlist]
+    def _try(self, index: int, parts: list[MovingPart], done: set[int]) -> tuple[MovingPart, set[int]]:
+        """The best motion of one cluster.
 
-        in_cluster = self._inside(own.splats, [box])
-        in_any = self._inside(own.splats, [b for c, b in zip(self.clusters, self.boxes, strict=True) if c.state == state])
-        piece = own.splats[in_cluster]
-        rest = Splats.concatenate([own.splats[~in_any & ~in_cluster], *self._placed(parts, state, other)])
-        views = self._judges(other)
-        absent = photo_error(rest, piece[:0], SE3.identity(dtype=torch.float64), target.stack, views)
-        judged = []
+        Returns:
+            The part, and the indices of the clusters that move with it in its own state.
+        """
+        cluster, box = self.clusters[index], self.boxes[index]
+        state, other = cluster.state, 1 - cluster.state
+        target = self.looks[other]
+        open_ = [i for i in range(len(self.clusters)) if i not in done]
+        arrivals = [i for i in open_ if self.clusters[i].state == other]
+        siblings = [i for i in open_ if self.clusters[i].state == state and i != index]
+        motions = candidate_motions(box, self.base_box, [self.boxes[i] for i in arrivals])
+        landing = np.concatenate([self.clusters[i].points for i in arrivals]) if arrivals else np.zeros((0, 3))
+        landing = self._sample(landing, 300)
+        outside, unexplained = hull_scores(motions, self._sample(cluster.points, 300), target.hull, landing, box)
+        odd = np.array([oddity(motions[m], box) for m in range(len(outside))])
+        ranked = np.argsort(outside + unexplained + 0.25 * odd, kind="stable")
+        ranked = ranked[outside[ranked] < outside.min() + 0.5]
+        ranked = ranked[distinct(motions[ranked], box, 0.08, self.config.shortlist)]
+        fits = np.zeros((len(self.clusters), len(outside)), bool)
+        for i in siblings:
+            sample = self._sample(self.clusters[i].points, 100)
+            fits[i] = hull_scores(motions, sample, target.hull, np.zeros((0, 3)), self.boxes[i])[0] < 0.3
+
+        scene = Scene(target, self._rest(parts, state, other), self._judges(other))
+        absent = scene.error(None, SE3.identity(dtype=torch.float64))
+        judged: list[tuple[Hypothesis, frozenset[int]]] = []
         for m in ranked:
-            error = photo_error(rest, piece, motions[int(m)], target.stack, views)
-            judged.append(Hypothesis(motions[int(m)], float(outside[m]), float(unexplained[m]), error))
-        judged.sort(key=lambda hypothesis: hypothesis.image_error)
-        finalists = distinct(judged, box, 0.15, self.config.finalists)
-        refined = [
-            refine(h, rest, piece, box, target.stack, views, self.config.steps, self.config.rate) for h in finalists
-        ]
-        refined.sort(key=lambda hypothesis: hypothesis.image_error)
-        refined = distinct(refined, box, 0.1, len(refined))
-        part = MovingPart(state, cluster.points, refined[0], tuple(refined[1:]))
-        return part, (absent - refined[0].image_error) / absent
+            together = frozenset(i for i in siblings if fits[i, m])
+            for group in {frozenset(), together}:
+                start = Hypothesis(motions[int(m)], float(outside[m]), float(unexplained[m]), float(odd[m]))
+                judged.append((scene.judge(start, self._piece({index, *group}), quick=True), group))
+        gain = max(absent - min(h.image_error for h, _ in judged), 0.0)
+        judged.sort(key=lambda row: row[0].cost(gain))
+        chosen = distinct(stack_motions([start for start, _ in judged]), box, 0.15, self.config.finalists)
+        refined = []
+        for start, group in (judged[c] for c in chosen):
+            piece = self._piece({index, *group})
+            refined.append((refine(start, scene, piece, box, self.config.steps, self.config.rate), group))
+        gain = max(absent - min(h.image_error for h, _ in refined), 0.0)
+        refined.sort(key=lambda row: row[0].cost(gain))
+        chosen = distinct(stack_motions([h for h, _ in refined]), box, 0.1, len(refined))
+        refined = [refined[c] for c in chosen]
+        best, group = refined[0]
+        members = {index, *group}
+        points = np.concatenate([self.clusters[i].points for i in sorted(members)])
+        gain = (absent - best.image_error) / absent
+        return MovingPart(state, points, best, gain, tuple(rival for rival, _ in refined[1:])), members
+
+    def _piece(self, members: set[int]) -> Splats:
+        """The splats of the clusters in `members`, all of one state."""
+        splats = self.looks[self.clusters[min(members)].state].splats
+        return splats[self._inside(splats, [self.boxes[i] for i in sorted(members)])]
+
+    def _rest(self, parts: list[MovingPart], state: int, other: int) -> Splats:
+        """All that stands still in `state`, with the parts found so far as they stand in `other`."""
+        splats = self.looks[state].splats
+        moving = self._inside(splats, [b for c, b in zip(self.clusters, self.boxes, strict=True) if c.state == state])
+        return Splats.concatenate([splats[~moving], *self._placed(parts, state, other)])
 
     def _placed(self, parts: list[MovingPart], state: int, other: int) -> list[Splats]:
         """Splats of the parts found so far, as they stand in state `other`, taken from the state that shows them."""

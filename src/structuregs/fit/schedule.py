@@ -1,9 +1,8 @@
-"""What a fit does when: the configuration and its presets.  Imports no torch, so that `--help` is quick."""
+"""What a fit does when: the configuration and its presets."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
-Preset = Literal["fast", "default", "paper"]
+from ..boxes import StartConfig
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Growth:
     """Mean screen-space gradient (in half image sizes) above which a splat is cloned or split."""
     small: float = 0.01
     """Splats smaller than this (times the object's size) are cloned, larger ones split."""
-    most: int = 60_000
+    most: int = 40_000
     """No more splats than this."""
     faint: float = 0.005
     """Splats of lower opacity go."""
@@ -75,11 +74,11 @@ class FitConfig:
     image_from: int = 150
     """Step at which the image loss begins."""
     structure_size: int = 96
-    """Longer side of the structure images, pixels."""
+    """Size of the structure images: the side of a square with as many pixels."""
     motions_with_structure: bool = False
     """Whether the losses on boxes move the motions too."""
     sizes: tuple[tuple[float, int], ...] = ((0.0, 200), (0.5, 400), (0.85, 800))
-    """(part of the fit, longer side of the images in pixels) from which on images have that size; never more than they have."""
+    """(part of the fit, size) from which on images have that size, cropped to the object; never more than they have."""
     image_weight: float = 10.0
     """Of the image loss."""
     ssim_weight: float = 0.2
@@ -88,17 +87,21 @@ class FitConfig:
     """Of the mask's error beside the colour's."""
     tint_penalty: float = 0.02
     """Of the mean absolute colour difference between the states."""
+    join_at: float = 0.35
+    """Part of the fit after which parts that touch and move alike are made one."""
     one_joint_from: float = 0.6
     """Part of the fit after which every motion is held to its joint's one degree of freedom; 1 for never."""
     checkpoint_every: int = 250
     """Steps between two checkpoints."""
+    start: StartConfig = field(default_factory=StartConfig)
+    """What comes before the fit: hulls, looks, boxes, motions."""
     rates: Rates = field(default_factory=Rates)
     """Learning rates."""
     growth: Growth = field(default_factory=Growth)
     """Densification and pruning."""
 
 
-PRESETS: dict[Preset, FitConfig] = {
+PRESETS: dict[str, FitConfig] = {
     "fast": FitConfig(steps=700, structure_until=60, loose_until=60, image_from=60, sizes=((0.0, 200), (0.7, 320))),
     "default": FitConfig(),
     "paper": FitConfig(

@@ -65,7 +65,7 @@ class Variables:
             xyz = turn.xyz + centres - (turn.rotation @ centres[..., None])[..., 0]
             moved = SE3.from_quat(turn.wxyz, xyz) @ SE3(self.start[1:])
         else:
-            turns = torch.tensor([[kind == "revolute"] for kind in self.kinds], device=rows.device)
+            turns = torch.tensor([kind == "revolute" for kind in self.kinds], dtype=torch.bool, device=rows.device)[:, None]
             zeros = torch.zeros_like(rows[:, :3])
             omega = torch.where(turns, rows[:, :3], zeros)
             turn = SE3.exp(torch.cat([zeros, omega], -1))
@@ -122,4 +122,3 @@ def detached(variables: Variables) -> PosedParts:
     """The posed parts without history."""
     with torch.no_grad():
         return variables.parts().detach()
-

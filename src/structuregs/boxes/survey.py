@@ -1,0 +1,106 @@
+"""From a capture to a look at each state, and from moving parts to boxes with their motions."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from ..capture import Capture, stack_views
+from ..geometry import SE3, Box
+from ..points import Silhouettes, object_bounds, points_from
+from .appearance import AppearanceConfig, fit_state, surface_points
+from .cue import StateLook, box_around, clusters
+from .partition import MovingPart, PartSearch, SearchConfig
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    """How boxes and motions are found before the fit."""
+
+    voxels: int = 96
+    """Voxels of the visual hulls along the object's longest side."""
+    mask_size: int = 256
+    """Size of the masks that carve the hulls: the side of a square with as many pixels."""
+    margin: float = 1.0
+    """By how many voxels boxes are grown beyond the points that they hold."""
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    """The quick look at each state."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """The search for motions."""
+
+
+def survey(capture: Capture, source: str, config: StartConfig, seed: int) -> tuple[StateLook, StateLook]:
+    """Hull, quick look and surface points of both states.
+
+    Args:
+        capture: its training views are used.
+        source: where the points come from: "hull", "depth" or a file (see `points.points_from`).
+        config: sizes.
+        seed: of the splats' places.
+    """
+    stacks = [stack_views(views, config.mask_size) for views in capture.train]
+    silhouettes = tuple(Silhouettes(stack.cameras, stack.alpha.astype(np.float32) / 255) for stack in stacks)
+    low, high = object_bounds(silhouettes)
+    given = points_from(capture, source)
+    looks = []
+    for state, views in enumerate(capture.train):
+        hull = silhouettes[state].carve(low, high, config.voxels)
+        stack = stack_views(views, config.appearance.size)
+        splats = fit_state(stack, hull, config.appearance, seed)
+        points = given[state] if given else surface_points(splats, stack, hull, config.appearance.looks)
+        looks.append(StateLook(stack, hull, points, splats))
+    return looks[0], looks[1]
+
+
+def _grown(points: Float64[np.ndarray, "P 3"], by: float) -> Box:
+    box = box_around(points, thinnest=0.5 * by)
+    return Box(box.T_world_box, box.half_extents + by)
+
+
+def boxes_of_parts(looks: tuple[StateLook, StateLook], parts: list[MovingPart], config: StartConfig) -> tuple[Box, SE3]:
+    """Boxes in state 0 and motions (K of each, float32, the base first) of the parts that a search found."""
+    by = config.margin * looks[0].hull.voxel
+    moving = [_grown(part.points_in(0), by) for part in parts]
+    still = []
+    for state, look in enumerate(looks):
+        points = torch.from_numpy(look.points)
+        free = torch.ones(len(points), dtype=torch.bool)
+        for box, part in zip(moving, parts, strict=True):
+            free &= ~(box.moved(part.motion) if state else box).contains(points)
+        still.append(points[free].numpy())
+    boxes = [_grown(np.concatenate(still), by), *moving]
+    return _stacked(boxes, [SE3.identity(dtype=torch.float64), *(part.motion for part in parts)])
+
+
+def boxes_at_rest(looks: tuple[StateLook, StateLook], count: int | None, config: StartConfig) -> tuple[Box, SE3]:
+    """The supplement's start (1.3): a box for each dominant cluster of departed points, one for the rest, and no motion.
+
+    Where nothing departed (the parts are shut in state 0), the clusters of arrived points serve.
+
+    Args:
+        looks: of both states.
+        count: the expected number of moving parts; all clusters if None.
+        config: sizes.
+    """
+    by = config.margin * looks[0].hull.voxel
+    found = clusters(looks, config.search.cue)
+    chosen = [c for c in found if c.state == 0] or found
+    moving = [_grown(c.points, by) for c in chosen[:count]]
+    points = torch.from_numpy(looks[0].points)
+    free = torch.ones(len(points), dtype=torch.bool)
+    for box in moving:
+        free &= ~box.contains(points)
+    boxes = [_grown(points[free].numpy(), by), *moving]
+    return _stacked(boxes, [SE3.identity(dtype=torch.float64)] * len(boxes))
+
+
+def _stacked(boxes: list[Box], motions: list[SE3]) -> tuple[Box, SE3]:
+    pose = SE3(torch.stack([box.T_world_box.wxyz_xyz for box in boxes]).float())
+    half_extents = torch.stack([box.half_extents for box in boxes]).float()
+    return Box(pose, half_extents), SE3(torch.stack([motion.wxyz_xyz for motion in motions]).float())
+
+
+def find_parts(looks: tuple[StateLook, StateLook], count: int | None, config: StartConfig, seed: int) -> list[MovingPart]:
+    """The moving parts with the motions that the photos prefer; `count` of them where it is given and that many are found."""
+    return PartSearch(looks, config.search, seed).search(count)

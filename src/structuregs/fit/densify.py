@@ -1,0 +1,109 @@
+"""Densification and pruning as in 3DGS; a child stays in its parent's box (supplement 1.2)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..geometry import quat_to_matrix
+from ..raster import Projection
+from .schedule import Growth
+from .variables import SPLAT_NAMES, Variables, part_index
+
+_SHRINK = 1.6  # the halves of a split splat are this much smaller (Kerbl et al. 2023)
+
+
+@dataclass
+class ScreenGradients:
+    """Running sums of the screen-space gradients of all splats, in half image sizes."""
+
+    total: Float[Tensor, " N"]
+    seen: Float[Tensor, " N"]
+
+    @staticmethod
+    def zeros(count: int, device: torch.device | None = None) -> "ScreenGradients":
+        """Nothing seen yet."""
+        return ScreenGradients(torch.zeros(count, device=device), torch.zeros(count, device=device))
+
+    def add(self, projection: Projection, size: float) -> None:
+        """Adds one image's; `projection.xy.grad` must hold the gradient.
+
+        Args:
+            projection: of the image.
+            size: the image's longer side in pixels, over the weight of the image loss (3DGS's thresholds know no weight).
+        """
+        gradient = projection.xy.grad
+        if gradient is not None:
+            self.total += gradient.norm(dim=-1) * (size / 2)
+            self.seen += projection.visible
+
+    @property
+    def mean(self) -> Float[Tensor, " N"]:
+        """Mean over the images that showed the splat."""
+        return self.total / self.seen.clamp(min=1)
+
+
+def _moved_within(
+    variables: Variables, source: Int[Tensor, " M"], generator: torch.Generator
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """Canonical centres drawn from splats' own Gaussians, and their smaller log scales."""
+    leaves = variables.leaves
+    scales = leaves["log_scales"][source].exp()
+    noise = torch.randn(len(source), 3, generator=generator).to(scales.device) * scales
+    offset = (quat_to_matrix(leaves["quats"][source]) @ noise[..., None])[..., 0]
+    part = part_index(variables.counts, scales.device)[source]
+    half_extents = leaves["log_half_extents"].exp()[part]
+    return leaves["means"][source] + offset / half_extents, torch.log(scales / _SHRINK)
+
+
+@torch.no_grad()
+def prune_mask(variables: Variables, growth: Growth) -> Bool[Tensor, " N"]:
+    """Splats to keep: neither faded nor out of their box."""
+    opaque = torch.sigmoid(variables.leaves["logit_opacities"]) > growth.faint
+    return opaque & (variables.leaves["means"].abs() < 1 + growth.outside).all(-1)
+
+
+@torch.no_grad()
+def grow(
+    variables: Variables, gradients: ScreenGradients | None, growth: Growth, size: float, generator: torch.Generator
+) -> tuple[Variables, Int[Tensor, " M"], Bool[Tensor, " M"]]:
+    """One round: prunes, and where gradients are given clones small splats and splits large ones.
+
+    Args:
+        variables: before.
+        gradients: since the last round; None to prune only.
+        growth: thresholds.
+        size: of the object, world units.
+        generator: for the places of the halves.
+
+    Returns:
+        Variables after; for each of their splats the index of the splat it was or came from; and whether it is new.
+    """
+    count = sum(variables.counts)
+    keep = prune_mask(variables, growth)
+    device = keep.device
+    clone = split = torch.zeros(count, dtype=torch.bool, device=device)
+    if gradients is not None:
+        wanted = keep & (gradients.mean > growth.gradient)
+        room = max(0, growth.most - int(keep.sum()))
+        if int(wanted.sum()) > room:
+            cut = torch.where(wanted, gradients.mean, torch.zeros_like(gradients.mean)).topk(room).indices
+            wanted = torch.zeros_like(wanted)
+            wanted[cut] = True
+        large = variables.leaves["log_scales"].amax(-1).exp() > growth.small * size
+        clone, split = wanted & ~large, wanted & large
+    everyone = torch.arange(count, device=device)
+    halves = everyone[split].repeat(2)
+    source = torch.cat([everyone[keep & ~split], everyone[clone], halves])
+    fresh = torch.zeros(len(source), dtype=torch.bool, device=device)
+    fresh[int((keep & ~split).sum()) :] = True
+    part = part_index(variables.counts, device)
+    order = torch.argsort(part[source], stable=True)
+    leaves = {name: variables.leaves[name][source] for name in SPLAT_NAMES}
+    if len(halves):
+        leaves["means"][-len(halves) :], leaves["log_scales"][-len(halves) :] = _moved_within(variables, halves, generator)
+    leaves = {name: value[order].requires_grad_() for name, value in leaves.items()}
+    counts = tuple(int(n) for n in torch.bincount(part[source], minlength=len(variables.counts)))
+    grown = Variables(variables.leaves | leaves, counts, variables.kinds, variables.start, variables.centres)
+    return grown, source[order], fresh[order]

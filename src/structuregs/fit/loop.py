@@ -1,0 +1,258 @@
+"""The fit's loop: posed parts in, better posed parts out, one view of either state a step."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..capture import Capture, ImageStack, stack_views
+from ..geometry import SE3
+from ..joints import kind_of
+from ..model import PosedParts
+from ..raster import image_loss, render
+from .densify import ScreenGradients, grow
+from .events import FitEvent, Note, StageStarted, Step
+from .schedule import FitConfig
+from .structure import StructureWeights, contact_loss, structure_loss
+from .variables import SPLAT_NAMES, Variables
+
+_REPORT_EVERY = 10
+_BOX_NAMES = ("box_quats", "box_centres", "log_half_extents")
+
+
+@dataclass
+class FitState:
+    """All that a fit needs to go on: what a checkpoint holds.
+
+    Attributes:
+        variables: what is being fitted.
+        moments: Adam's two moments of every leaf.
+        gradients: screen-space gradients since the last round of densification.
+        free_motions: the K motions (wxyz_xyz) as they were when they were still free.
+        step: steps done.
+    """
+
+    variables: Variables
+    moments: dict[str, tuple[Tensor, Tensor]]
+    gradients: ScreenGradients
+    free_motions: Tensor
+    step: int
+
+    @staticmethod
+    def start(parts: PosedParts) -> "FitState":
+        """The state before the first step."""
+        variables = Variables.of(parts)
+        gradients = ScreenGradients.zeros(sum(parts.counts), parts.tint.device)
+        return FitState(variables, _no_moments(variables), gradients, parts.motions.wxyz_xyz.clone(), 0)
+
+    def save(self, file: Path) -> None:
+        """Writes the checkpoint aside and renames it."""
+        v = self.variables
+        record = {
+            "leaves": {name: leaf.detach() for name, leaf in v.leaves.items()},
+            "counts": v.counts,
+            "kinds": v.kinds,
+            "start": v.start,
+            "centres": v.centres,
+            "moments": self.moments,
+            "gradients": (self.gradients.total, self.gradients.seen),
+            "free_motions": self.free_motions,
+            "step": self.step,
+        }
+        staged = file.with_name(file.name + ".part")
+        torch.save(record, staged)
+        staged.replace(file)
+
+    @staticmethod
+    def load(file: Path, device: torch.device | None = None) -> "FitState":
+        """Reads a checkpoint.
+
+        Raises:
+            ValueError: the file is damaged.
+        """
+        try:
+            r = torch.load(file, map_location=device, weights_only=True)
+            leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
+            variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
+            return FitState(variables, r["moments"], ScreenGradients(*r["gradients"]), r["free_motions"], r["step"])
+        except (RuntimeError, KeyError, EOFError, ValueError, TypeError) as error:
+            raise ValueError(f"{file}: the checkpoint is damaged ({error}); delete it to fit this run from the start.") from error
+
+
+def _no_moments(variables: Variables) -> dict[str, tuple[Tensor, Tensor]]:
+    return {name: (torch.zeros_like(leaf.detach()), torch.zeros_like(leaf.detach())) for name, leaf in variables.leaves.items()}
+
+
+class Fitter:
+    """One fit under way: a capture, a configuration and a `FitState` that every step changes."""
+
+    def __init__(self, capture: Capture, config: FitConfig, state: FitState, seed: int, device: torch.device):
+        self.capture = capture
+        self.config = config
+        self.state = state
+        self.seed = seed
+        self.device = device
+        self.masks = [stack_views(views, config.structure_size) for views in capture.train]
+        self.stacks: tuple[int, list[ImageStack]] = (0, [])
+        boxes = state.variables.boxes()
+        self.size = float(boxes.half_extents.detach().norm(dim=-1).max())  # of the object, about its radius
+
+    def run(self, steps: int) -> Iterator[FitEvent]:
+        """Takes steps until `steps` are done; yields a `Step` now and then."""
+        yield StageStarted("fit", self.config.steps)
+        while self.state.step < min(steps, self.config.steps):
+            if self.state.step == round(self.config.join_at * self.config.steps):
+                yield from self._join_parts()
+            yield from self._settle_joints()
+            loss, psnr = self._step()
+            self._densify()
+            self.state.step += 1
+            if self.state.step % _REPORT_EVERY == 0:
+                yield Step("fit", self.state.step, loss, psnr, sum(self.state.variables.counts))
+
+    def _join_parts(self) -> Iterator[FitEvent]:
+        """Makes one part of two that touch and have come to move alike; a thing found in two pieces is one after all."""
+        while True:
+            with torch.no_grad():
+                parts = self.state.variables.parts().detach()
+            pair = moving_alike(parts)
+            if pair is None:
+                return
+            step = self.state.step
+            self.state = replace(FitState.start(parts.joined(*pair)), step=step)
+            yield Note(f"two parts that move alike are one from step {step} on; {len(parts) - 2} left")
+
+    def _settle_joints(self) -> Iterator[FitEvent]:
+        """Holds every motion to one degree of freedom once its time has come."""
+        variables = self.state.variables
+        if variables.kinds is None and self.state.step >= self.config.one_joint_from * self.config.steps:
+            with torch.no_grad():
+                motions = variables.motions()
+            self.state.free_motions = motions.wxyz_xyz
+            kinds = [kind_of(motions[k]) for k in range(1, len(variables.counts))]
+            variables.hold(kinds)
+            first, second = self.state.moments["motions"]
+            self.state.moments["motions"] = (torch.zeros_like(first), torch.zeros_like(second))
+            if kinds:
+                yield Note(f"joints at step {self.state.step}: {', '.join(kinds)}")
+
+    def _view(self, state: int, count: int) -> int:
+        """The view of a state for this step: every view once in each round, in an order of its own."""
+        turn, place = divmod(self.state.step, count)
+        return int(np.random.default_rng((self.seed, state, turn)).permutation(count)[place])
+
+    def _images(self) -> list[ImageStack]:
+        """Both states' images in the size that this step works at."""
+        size = [size for start, size in self.config.sizes if self.state.step >= start * self.config.steps][-1]
+        if self.stacks[0] != size:
+            self.stacks = (size, [stack_views(views, size) for views in self.capture.train])
+        return self.stacks[1]
+
+    def _step(self) -> tuple[float, float | None]:
+        """One step of the optimiser; its loss and the images' PSNR."""
+        config, step, variables = self.config, self.state.step, self.state.variables
+        loss = torch.zeros((), device=self.device)
+        psnr = None
+        parts = variables.parts()
+        if step < config.structure_until:
+            loss = loss + self._structure_loss(parts)
+        renders = []
+        if step >= config.image_from:
+            error, renders, psnr = self._image_loss(parts)
+            loss = loss + error
+        loss.backward()
+        for render_, size in renders:
+            self.state.gradients.add(render_.projection, size)
+        self._adam()
+        return float(loss.detach()), psnr
+
+    def _structure_loss(self, parts: PosedParts) -> Tensor:
+        views = [self._view(s, len(stack)) for s, stack in enumerate(self.masks)]
+        cameras = (self.masks[0].cameras[views[0]], self.masks[1].cameras[views[1]])
+        masks = [stack.target(v)[1].to(self.device) for stack, v in zip(self.masks, views, strict=True)]
+        motions = parts.motions if self.config.motions_with_structure else SE3(parts.motions.wxyz_xyz.detach())
+        loose = self.state.step < self.config.loose_until
+        return structure_loss(
+            parts.boxes, motions, cameras, (masks[0], masks[1]), StructureWeights(), softness=0.02 * self.size, loose=loose
+        )
+
+    def _image_loss(self, parts: PosedParts) -> tuple[Tensor, list, float | None]:
+        config = self.config
+        growing = self.state.step < config.growth.last * config.steps
+        loss = torch.zeros((), device=self.device)
+        renders, squares = [], []
+        for s, stack in enumerate(self._images()):
+            v = self._view(s, len(stack))
+            rgb, alpha = (image.to(self.device) for image in stack.target(v))
+            picture = render(parts.at_state(s), stack.cameras[v])
+            if growing:
+                picture.projection.xy.retain_grad()
+                renders.append((picture, max(picture.alpha.shape) / config.image_weight))
+            loss = loss + config.image_weight * image_loss(
+                picture.rgb, picture.alpha, rgb, alpha, ssim_weight=config.ssim_weight, alpha_weight=config.alpha_weight
+            )
+            if (self.state.step + 1) % _REPORT_EVERY == 0:
+                squares.append(float((picture.rgb.detach() - rgb).square().mean()))
+        if config.tint_penalty:
+            loss = loss + config.image_weight * config.tint_penalty * parts.tint.abs().mean()
+        return loss, renders, -10 * float(np.log10(max(np.mean(squares), 1e-12))) if squares else None
+
+    def _rate(self, name: str) -> float:
+        """The learning rate of a leaf in this step."""
+        rates, config = self.config.rates, self.config
+        done = max(0, self.state.step - config.image_from) / max(1, config.steps - config.image_from)
+        if name in _BOX_NAMES:
+            return rates.boxes * rates.final**done
+        if name == "motions" and self.state.step < config.image_from and not config.motions_with_structure:
+            return 0.0
+        final = rates.final if name in ("means", "motions") else rates.appearance_final
+        return getattr(rates, name) * final**done
+
+    @torch.no_grad()
+    def _adam(self) -> None:
+        """Adam (Kingma and Ba 2015), leaf by leaf."""
+        t = self.state.step + 1
+        correction = np.sqrt(1 - 0.999**t) / (1 - 0.9**t)
+        for name, leaf in self.state.variables.leaves.items():
+            rate = self._rate(name)
+            if leaf.grad is not None and rate:
+                first, second = self.state.moments[name]
+                first.lerp_(leaf.grad, 0.1)
+                second.mul_(0.999).addcmul_(leaf.grad, leaf.grad, value=0.001)
+                leaf.addcdiv_(first, second.sqrt().add_(1e-15), value=-rate * correction)
+            leaf.grad = None
+
+    def _densify(self) -> None:
+        """A round of densification or of pruning, where the schedule asks for one."""
+        config, growth, step = self.config, self.config.growth, self.state.step
+        if step < config.image_from or (step + 1) % growth.interval or step + 1 >= config.steps:
+            return
+        growing = growth.first * config.steps <= step < growth.last * config.steps
+        noise = torch.Generator().manual_seed(int(np.random.default_rng((self.seed, step)).integers(2**62)))
+        gradients = self.state.gradients if growing else None
+        self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.size, noise)
+        for name in SPLAT_NAMES:
+            first, second = (moment[source] for moment in self.state.moments[name])
+            first[fresh], second[fresh] = 0, 0
+            self.state.moments[name] = (first, second)
+        self.state.gradients = ScreenGradients.zeros(len(source), self.device)
+        if growing and growth.reset and (step + 1) % growth.reset == 0:
+            with torch.no_grad():
+                self.state.variables.leaves["logit_opacities"].clamp_(max=float(np.log(0.01 / 0.99)))
+
+
+def moving_alike(parts: PosedParts) -> tuple[int, int] | None:
+    """Two moving parts that touch and whose motions agree to a twentieth of their travel, the larger first; or None."""
+    for a in range(1, len(parts)):
+        for b in range(a + 1, len(parts)):
+            corners = torch.cat([parts.boxes.corners[a], parts.boxes.corners[b]])
+            ways = [parts.motions[k].apply(corners) - corners for k in (a, b)]
+            apart = (ways[0] - ways[1]).norm(dim=-1).mean()
+            travel = torch.minimum(ways[0].norm(dim=-1).mean(), ways[1].norm(dim=-1).mean())
+            gap = contact_loss(parts.boxes[[a, b]])
+            if apart < 0.05 * travel and gap < 0.05 * parts.boxes.half_extents[[a, b]].norm(dim=-1).amax():
+                return (a, b) if parts.counts[a] >= parts.counts[b] else (b, a)
+    return None

@@ -1,0 +1,284 @@
+"""From a capture to an articulated object: the whole way, in a run's folder that it can go on from."""
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+
+from ..boxes import boxes_at_rest, boxes_of_parts, find_parts, survey
+from ..capture import Capture
+from ..geometry import SE3, Box
+from ..joints import articulate, joints_of
+from ..model import ArticulatedObject, PosedParts, load_object, save_object
+from .events import Finished, FitEvent, Note, StageStarted, Step
+from .loop import FitState, Fitter
+from .schedule import PRESETS, FitConfig
+from .variables import strewn
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The files of a run (docs/format.md)."""
+
+    root: Path
+
+    @property
+    def config(self) -> Path:
+        """The effective configuration."""
+        return self.root / "config.json"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last checkpoint."""
+        return self.root / "checkpoints" / "last.pt"
+
+    @property
+    def metrics(self) -> Path:
+        """Loss and PSNR, one JSON record a line."""
+        return self.root / "metrics.jsonl"
+
+    @property
+    def timing(self) -> Path:
+        """Seconds spent, over all sittings."""
+        return self.root / "timing.json"
+
+    @property
+    def object(self) -> Path:
+        """The folder of the articulated object."""
+        return self.root / "object"
+
+    def begin(self, record: dict) -> None:
+        """Writes the configuration of a new run, or holds an old run's against it.
+
+        Raises:
+            ValueError: the folder holds a run of another configuration, or something that is no run.
+        """
+        if not self.config.exists():
+            if self.root.exists() and any(p.name != "capture" for p in self.root.iterdir()):
+                raise ValueError(f"{self.root}: the folder is not empty and holds no run; choose another with -o.")
+            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+            _write(self.config, json.dumps(record, indent=1) + "\n")
+            return
+        try:
+            before = json.loads(self.config.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{self.config}: not a configuration ({error}); choose another folder with -o.") from error
+        changed = [key for key in sorted(record.keys() | before.keys()) if _plain(record.get(key)) != before.get(key)]
+        if changed:
+            raise ValueError(
+                f"{self.root}: a run with another {', '.join(changed)} lies here; go on with the same or choose another folder."
+            )
+
+    def seconds(self) -> float:
+        """Seconds spent so far."""
+        return json.loads(self.timing.read_text())["total"] if self.timing.exists() else 0.0
+
+    def cut_metrics(self, step: int) -> None:
+        """Drops the records of steps after `step`, which a run that goes on will write again."""
+        if self.metrics.exists():
+            lines = [line for line in self.metrics.read_text().splitlines(keepends=True) if line.endswith("\n")]
+            _write(self.metrics, "".join(line for line in lines if json.loads(line)["step"] <= step))
+
+
+def _plain(value: object) -> object:
+    """A value as JSON gives it back."""
+    return json.loads(json.dumps(value))
+
+
+def _write(file: Path, text: str) -> None:
+    staged = file.with_name(file.name + ".part")
+    staged.write_text(text)
+    staged.replace(file)
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of a name: "auto" takes the GPU where the renderer can use it.
+
+    Raises:
+        ValueError: "cuda" on a machine without a GPU that torch can use.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch finds no GPU here; use --device cpu, or install a torch build with CUDA.")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
+def start_parts(
+    capture: Capture, config: FitConfig, *, parts: int | None, points: str, seed: int
+) -> Iterator[FitEvent | PosedParts]:
+    """Boxes, motions and the splats strewn in them; the last thing yielded is the `PosedParts`."""
+    yield StageStarted("look", 2)
+    looks = survey(capture, points, config.start, seed)
+    yield Step("look", 2, 0.0, None, sum(len(look.splats) for look in looks))
+    if config.hypotheses:
+        yield StageStarted("search", 1)
+        found = find_parts(looks, parts, config.start, seed)
+        boxes, motions = boxes_of_parts(looks, found, config.start)
+        yield Step("search", 1, 0.0, None, 0)
+    else:
+        boxes, motions = boxes_at_rest(looks, parts, config.start)
+    count = len(boxes.half_extents) - 1
+    yield Note(f"{count} moving part{'' if count == 1 else 's'} found")
+    if parts is not None and count != parts:
+        yield Note(f"{parts} were asked for: what else moves does not show in masks and photos")
+    stack = looks[0].stack
+    solid = stack.alpha > 250
+    rgb = torch.from_numpy(stack.rgb[solid].mean(0) / 255).float()
+    generator = torch.Generator().manual_seed(seed)
+    yield strewn(boxes, motions, config.splats_per_part, config.sh_degree, generator, rgb)
+
+
+def tightened(parts: PosedParts) -> PosedParts:
+    """The same splats in boxes that reach just as far as their opaque splats do."""
+    parts = parts.detach()
+    centres, half_extents, means = [], [], []
+    for k, canonical in enumerate(parts.splats.means.split(parts.counts)):
+        box = parts.boxes[k]
+        local = canonical * box.half_extents
+        opaque = local[parts.part_splats(k).opacities > 0.3]
+        low, high = (
+            (opaque.quantile(q, 0) for q in (0.002, 0.998)) if len(opaque) > 10 else (-box.half_extents, box.half_extents)
+        )
+        half = ((high - low) / 2).clamp(min=1e-6)
+        centre = (high + low) / 2
+        centres.append(box.T_world_box.apply(centre))
+        half_extents.append(half)
+        means.append((local - centre) / half)
+    boxes = Box(SE3.from_quat(parts.boxes.T_world_box.wxyz, torch.stack(centres)), torch.stack(half_extents))
+    return replace(parts, boxes=boxes, splats=replace(parts.splats, means=torch.cat(means)))
+
+
+def finished_object(state: FitState) -> ArticulatedObject:
+    """The object of a fit that has taken its last step.
+
+    A joint is no clearer than it was while its motion was still free: the lower confidence of the two stands.
+    """
+    with torch.no_grad():
+        parts = tightened(state.variables.parts())
+    obj = articulate(parts, state.variables.kinds)
+    if state.variables.kinds is None:
+        return obj
+    free = joints_of(replace(parts, motions=SE3(state.free_motions)), state.variables.kinds)
+    joints = [
+        replace(joint, confidence=before.confidence, review=joint.review or before.review)
+        if before.confidence < joint.confidence
+        else joint
+        for joint, before in zip(obj.joints, free, strict=True)
+    ]
+    return replace(obj, joints=tuple(joints))
+
+
+def fit_run(
+    capture: Capture,
+    run: Path,
+    config: FitConfig,
+    *,
+    device: str = "auto",
+    parts: int | None = None,
+    points: str = "hull",
+    seed: int = 0,
+) -> Iterator[FitEvent]:
+    """Fits a capture in a run's folder, from its last checkpoint where there is one, and yields what happens.
+
+    Args:
+        capture: what was photographed.
+        run: folder of the run; made if it is not there.
+        config: the whole configuration.
+        device: "auto", "cpu" or "cuda".
+        parts: number of moving parts; estimated if None.
+        points: where first points come from: "hull", "depth" or a file.
+        seed: of all randomness; the same seed gives the same bytes on a CPU.
+
+    Raises:
+        ValueError: the folder holds another run, or a damaged one.
+    """
+    chosen, folder = choose_device(device), RunFolder(run)
+    views = [len(state) for state in capture.train]
+    record = {"capture": str(capture.root.resolve()), "views": views, "seed": seed, "parts": parts, "points": points}
+    folder.begin(record | {"fit": asdict(config)})
+    if (folder.object / "object.json").exists():
+        yield Note(f"{run} is finished; nothing is left to do")
+        yield Finished(load_object(folder.object), run)
+        return
+    torch.set_num_threads(1)  # the renderer has the cores; small tensors only lose by being shared out
+    clock = _Clock(folder)
+    if folder.checkpoint.exists():
+        state = FitState.load(folder.checkpoint, chosen)
+        folder.cut_metrics(state.step)
+        yield Note(f"going on from step {state.step}")
+    else:
+        begun = None
+        for item in start_parts(capture, config, parts=parts, points=points, seed=seed):
+            if isinstance(item, PosedParts):
+                begun = item
+            else:
+                yield item
+        assert begun is not None
+        state = FitState.start(begun.to(chosen))
+        state.save(folder.checkpoint)
+        clock.save()
+    fitter = Fitter(capture, config, state, seed, chosen)
+    while fitter.state.step < config.steps:
+        done = fitter.state.step
+        for event in fitter.run(done - done % config.checkpoint_every + config.checkpoint_every):
+            if isinstance(event, Step):
+                _append(folder.metrics, event)
+            yield event
+        fitter.state.save(folder.checkpoint)
+        clock.save()
+    obj = finished_object(fitter.state)
+    save_object(obj, folder.object)
+    clock.save()
+    yield Finished(obj, run)
+
+
+def _append(file: Path, step: Step) -> None:
+    with file.open("a") as out:
+        out.write(json.dumps({"step": step.step, "loss": step.loss, "psnr": step.psnr, "splats": step.splats}) + "\n")
+
+
+class _Clock:
+    """Adds this sitting's seconds to the run's."""
+
+    def __init__(self, folder: RunFolder):
+        self.file, self.before, self.began = folder.timing, folder.seconds(), time.monotonic()
+
+    def save(self) -> None:
+        """Writes the total so far."""
+        _write(self.file, json.dumps({"total": round(self.before + time.monotonic() - self.began, 2)}) + "\n")
+
+
+def reconstruct(
+    capture: Capture,
+    run: Path | None = None,
+    config: FitConfig | None = None,
+    *,
+    device: str = "auto",
+    parts: int | None = None,
+    points: str = "hull",
+    seed: int = 0,
+) -> ArticulatedObject:
+    """The articulated object of a capture.
+
+    Args:
+        capture: what was photographed.
+        run: folder to keep the run in, as `structuregs fit -o` does; nothing is kept if None.
+        config: default: the preset "default".
+        device: "auto", "cpu" or "cuda".
+        parts: number of moving parts; estimated if None.
+        points: where first points come from: "hull", "depth" or a file.
+        seed: of all randomness.
+    """
+    import tempfile
+
+    config = config or PRESETS["default"]
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = run if run is not None else Path(scratch)
+        for event in fit_run(capture, folder, config, device=device, parts=parts, points=points, seed=seed):
+            if isinstance(event, Finished):
+                return event.obj
+    raise RuntimeError("the fit ended without a result.")
