@@ -1,8 +1,10 @@
 """The fit's loop: posed parts in, better posed parts out, one view of either state a step."""
 
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from pickle import UnpicklingError
 
 import numpy as np
 import torch
@@ -21,6 +23,8 @@ from .variables import SPLAT_NAMES, Variables
 
 _REPORT_EVERY = 10
 _BOX_NAMES = ("box_quats", "box_centres", "log_half_extents")
+# What torch raises over a file that was cut short or is something else, and what reading another record raises.
+_DAMAGED = (RuntimeError, EOFError, OSError, UnpicklingError, AttributeError, KeyError, TypeError, ValueError)
 
 
 @dataclass
@@ -73,13 +77,14 @@ class FitState:
         Raises:
             ValueError: the file is damaged.
         """
+        content = io.BytesIO(file.read_bytes())
         try:
-            r = torch.load(file, map_location=device, weights_only=True)
+            r = torch.load(content, map_location=device, weights_only=True)
             leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
             variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
             return FitState(variables, r["moments"], ScreenGradients(*r["gradients"]), r["free_motions"], r["step"])
-        except (RuntimeError, KeyError, EOFError, ValueError, TypeError) as error:
-            raise ValueError(f"{file}: the checkpoint is damaged ({error}); delete it to fit this run from the start.") from error
+        except _DAMAGED as error:
+            raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
 
 
 def _no_moments(variables: Variables) -> dict[str, tuple[Tensor, Tensor]]:

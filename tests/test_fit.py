@@ -1,0 +1,496 @@
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from door_and_drawer import DOOR, DRAWER, made_of, photographed
+from structuregs.fit.densify import ScreenGradients, grow
+from structuregs.fit.loop import FitState, Fitter, moving_alike
+from structuregs.fit.reconstruct import RunFolder, choose_device, finished_object, tightened
+from structuregs.fit.schedule import PRESETS, FitConfig, Growth, Rates
+from structuregs.fit.variables import SPLAT_NAMES, Variables, part_index
+from structuregs.geometry import SE3, Box, Screw, quat_to_matrix
+from structuregs.joints import constrain
+from structuregs.model import PosedParts, Splats
+from structuregs.raster import render
+
+DOOR_AND_DRAWER = made_of(DOOR.motion(), DRAWER.motion()).parts
+
+
+def turned_parts() -> PosedParts:
+    """The door and the drawer with boxes turned every way."""
+    pose = SE3.exp(torch.tensor([[0.0, 0, 0, 0.3, -0.2, 0.5], [0.5, 0.1, 0.2, 1.0, 0.4, -0.3], [-0.2, 0, 0.3, -0.8, 1.1, 0.2]]))
+    return replace(DOOR_AND_DRAWER, boxes=Box(pose, DOOR_AND_DRAWER.boxes.half_extents))
+
+
+def same_motion(a: SE3, b: SE3, atol: float = 2e-6) -> None:
+    torch.testing.assert_close(a.as_matrix().double(), b.as_matrix().double(), atol=atol, rtol=0)
+
+
+def same_splats(a: Splats, b: Splats) -> None:
+    """The same Gaussians: quaternions of one rotation may differ in sign."""
+    for name in ("means", "log_scales", "logit_opacities", "sh"):
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(quat_to_matrix(a.quats), quat_to_matrix(b.quats), atol=1e-5, rtol=0)
+
+
+class TestVariables:
+    def test_give_back_the_parts_they_were_made_of(self):
+        parts = turned_parts()
+        again = Variables.of(parts).parts()
+        same_motion(again.motions, parts.motions)
+        same_motion(again.boxes.T_world_box, parts.boxes.T_world_box)
+        torch.testing.assert_close(again.boxes.half_extents, parts.boxes.half_extents)
+        same_splats(again.splats, parts.splats)
+        torch.testing.assert_close(again.tint, parts.tint)
+        assert again.counts == parts.counts
+
+    def test_changing_a_leaf_changes_no_part_they_were_made_of(self):
+        parts = turned_parts()
+        before = parts.splats.means.clone()
+        with torch.no_grad():
+            Variables.of(parts).leaves["means"].add_(1.0)
+        torch.testing.assert_close(parts.splats.means, before)
+
+    def test_a_free_rotation_turns_about_the_part_where_it_has_come_to(self):
+        parts = turned_parts()
+        variables = Variables.of(parts)
+        arrived = parts.motions.apply(parts.boxes.T_world_box.xyz)
+        rows = torch.tensor([[0.0] * 6, [0.0, 0, 0, 0.3, 0.1, -0.2], [0.1, -0.2, 0.05, 0.0, 0, 0]])
+        with torch.no_grad():
+            variables.leaves["motions"].copy_(rows)
+        moved = variables.motions()
+        landed = moved.apply(parts.boxes.T_world_box.xyz)
+        torch.testing.assert_close(landed, arrived + rows[:, :3], atol=1e-6, rtol=0)
+        turn = moved @ parts.motions.inverse()
+        torch.testing.assert_close(turn.log()[:, 3:], rows[:, 3:], atol=1e-5, rtol=0)
+
+    @pytest.mark.parametrize("held", [False, True])
+    def test_the_base_stands_still_whatever_its_row_says(self, held: bool):
+        variables = Variables.of(turned_parts())
+        if held:
+            variables.hold(["revolute", "prismatic"])
+        with torch.no_grad():
+            variables.leaves["motions"][0] = 1.0
+        same_motion(variables.motions()[0], SE3.identity(), atol=0)
+
+    def test_holding_keeps_motions_of_one_degree_of_freedom(self):
+        g = torch.Generator().manual_seed(3)
+        for _ in range(5):
+            axes = torch.nn.functional.normalize(torch.randn(2, 3, generator=g, dtype=torch.float64), dim=-1)
+            hinge = Screw("revolute", axes[0], torch.randn(3, generator=g, dtype=torch.float64)).motion(1.1)
+            slide = Screw("prismatic", axes[1], torch.zeros(3, dtype=torch.float64)).motion(0.4)
+            variables = Variables.of(replace(turned_parts(), motions=made_of(hinge, slide).parts.motions))
+            before = variables.motions()
+            variables.hold(["revolute", "prismatic"])
+            same_motion(variables.motions(), before, atol=5e-6)
+            assert variables.kinds == ("revolute", "prismatic")
+
+    def test_holding_another_motion_takes_the_closest_screw_at_the_part(self):
+        parts = turned_parts()
+        mixed = SE3.exp(torch.tensor([[0.0] * 6, [0.2, 0.1, 0.3, 0.5, 0.2, 0.1], [0.4, 0.1, 0.0, 0.02, 0.01, 0.03]]))
+        variables = Variables.of(replace(parts, motions=mixed))
+        variables.hold(["revolute", "prismatic"])
+        for k, kind in ((1, "revolute"), (2, "prismatic")):
+            same_motion(variables.motions()[k], constrain(mixed[k], kind, parts.boxes.T_world_box.xyz[k]), atol=5e-6)
+
+    def test_a_held_motion_stays_one_screw_for_any_values(self):
+        variables = Variables.of(turned_parts())
+        variables.hold(["revolute", "prismatic"])
+        rows = torch.randn(3, 6, generator=torch.Generator().manual_seed(0))
+        with torch.no_grad():
+            variables.leaves["motions"].copy_(rows)
+        motions = variables.motions()
+        torch.testing.assert_close(motions[1].apply(rows[1, 3:]), rows[1, 3:], atol=1e-5, rtol=0)
+        torch.testing.assert_close(motions[1].log()[3:], rows[1, :3], atol=1e-5, rtol=0)
+        same_motion(motions[2], SE3.from_quat(torch.tensor([1.0, 0, 0, 0]), rows[2, :3]))
+
+    @pytest.mark.parametrize("held", [False, True])
+    def test_gradients_reach_every_leaf_that_moves_the_picture(self, held: bool):
+        variables = Variables.of(turned_parts())
+        if held:
+            variables.hold(["revolute", "prismatic"])
+        splats = variables.parts().at_state(1)
+        sum((value.square().sum() for value in splats.tensors().values()), torch.zeros(())).backward()
+        for name, leaf in variables.leaves.items():
+            assert leaf.grad is not None, name
+            assert leaf.grad.abs().sum() > 0, name
+
+    def test_an_object_without_joints_can_be_held(self):
+        variables = Variables.of(made_of().parts)
+        variables.hold([])
+        same_motion(variables.motions(), SE3.identity(1), atol=0)
+
+
+def gradients_of(count: int, strong: Tensor) -> ScreenGradients:
+    """Three images seen by all, with mean gradients of 1 for the splats in `strong` and none for others."""
+    gradients = ScreenGradients.zeros(count)
+    gradients.total[strong] = 3.0
+    gradients.seen += 3
+    return gradients
+
+
+class TestDensification:
+    growth = Growth(gradient=0.5, small=0.1, most=10_000, faint=0.01, outside=0.2)
+    size = 1.0
+
+    def grown(self, variables: Variables, strong: Tensor | None, growth: Growth | None = None, seed: int = 0):
+        gradients = None if strong is None else gradients_of(sum(variables.counts), strong)
+        return grow(variables, gradients, growth or self.growth, self.size, torch.Generator().manual_seed(seed))
+
+    def variables(self, large: slice | Tensor) -> Variables:
+        """360 small splats (0.05) in three parts; those that `large` selects are 0.2 by 0.3 by 0.4."""
+        variables = Variables.of(turned_parts())
+        with torch.no_grad():
+            variables.leaves["log_scales"][large] = torch.tensor([0.2, 0.3, 0.4]).log()
+        return variables
+
+    def test_pruning_takes_what_faded_and_what_left_its_box(self):
+        variables = self.variables(slice(0, 0))
+        with torch.no_grad():
+            variables.leaves["logit_opacities"][[0, 130]] = math.log(0.009 / 0.991)
+            variables.leaves["logit_opacities"][1] = math.log(0.011 / 0.989)
+            variables.leaves["means"][[2, 140, 350]] = torch.tensor([0.0, -1.21, 0.0])
+            variables.leaves["means"][3] = torch.tensor([1.19, -1.19, 1.19])
+        after, source, fresh = self.grown(variables, None)
+        assert source.tolist() == [i for i in range(360) if i not in (0, 2, 130, 140, 350)]
+        assert after.counts == (118, 118, 119)
+        assert not fresh.any()
+        for name in SPLAT_NAMES:
+            torch.testing.assert_close(after.leaves[name], variables.leaves[name][source])
+
+    def test_small_splats_are_cloned_and_large_ones_split(self):
+        large = torch.zeros(360, dtype=torch.bool)
+        large[100:140] = True
+        strong = torch.arange(360) % 4 == 0
+        variables = self.variables(large)
+        after, source, fresh = self.grown(variables, strong)
+        clones, splits = strong & ~large, strong & large
+        per_part = [int((clones | splits)[120 * k : 120 * k + 120].sum()) for k in range(3)]
+        assert after.counts == tuple(120 + n for n in per_part), "a clone adds one; two halves take one splat's place"
+        assert int(fresh.sum()) == int(clones.sum()) + 2 * int(splits.sum())
+        times = torch.bincount(source, minlength=360)
+        torch.testing.assert_close(times, 1 + strong.long())
+        assert sorted(source[fresh].tolist()) == sorted(
+            [*clones.nonzero()[:, 0].tolist(), *2 * splits.nonzero()[:, 0].tolist()]
+        )
+
+    def test_children_stay_in_the_part_of_their_parent(self):
+        after, source, _ = self.grown(self.variables(slice(60, 200)), torch.ones(360, dtype=torch.bool))
+        part = part_index(after.counts, torch.device("cpu"))
+        torch.testing.assert_close(part, part_index((120, 120, 120), torch.device("cpu"))[source])
+        assert (part.diff() >= 0).all()
+        assert {len(after.leaves[name]) for name in SPLAT_NAMES} == {sum(after.counts)}
+
+    def test_clones_are_their_parents_and_halves_are_smaller(self):
+        variables = self.variables(slice(200, 260))
+        after, source, fresh = self.grown(variables, torch.ones(360, dtype=torch.bool))
+        half = fresh & (source >= 200) & (source < 260)
+        for name in SPLAT_NAMES:
+            same = ~half if name in ("means", "log_scales") else torch.ones_like(half)
+            torch.testing.assert_close(after.leaves[name][same], variables.leaves[name][source][same])
+        expected = torch.tensor([0.2, 0.3, 0.4]) / 1.6
+        torch.testing.assert_close(after.leaves["log_scales"][half].exp(), expected.expand(120, 3))
+
+    def test_halves_are_strewn_as_their_parent_is(self):
+        """Standardised by the parent's Gaussian, in the world, the places of the halves are standard normal."""
+        parts = turned_parts()
+        variables = self.variables(slice(0, 360))
+        rows = []
+        for seed in range(4):
+            after, source, _ = self.grown(variables, torch.ones(360, dtype=torch.bool), seed=seed)
+            children, parents = after.parts().at_state(1), variables.parts().at_state(1)[source]
+            offset = quat_to_matrix(parents.quats).transpose(1, 2) @ (children.means - parents.means)[..., None]
+            rows.append((offset[..., 0] / parents.scales).detach())
+        normal = torch.cat(rows)
+        assert len(normal) == 4 * 720
+        assert len(parts) == 3
+        torch.testing.assert_close(normal.mean(0), torch.zeros(3), atol=0.08, rtol=0)
+        torch.testing.assert_close(normal.T.cov(), torch.eye(3), atol=0.1, rtol=0)
+
+    def test_there_are_never_more_than_allowed_and_the_strongest_come_first(self):
+        gradients = gradients_of(360, torch.ones(360, dtype=torch.bool))
+        gradients.total += torch.arange(360)
+        growth = replace(self.growth, most=370)
+        after, source, fresh = grow(self.variables(slice(0, 0)), gradients, growth, self.size, torch.Generator())
+        assert sum(after.counts) == 370
+        assert sorted(source[fresh].tolist()) == list(range(350, 360))
+        too_many = grow(self.variables(slice(0, 0)), gradients, replace(growth, most=100), self.size, torch.Generator())
+        assert sum(too_many[0].counts) == 360
+
+    def test_the_mean_gradient_counts_the_images_that_show_the_splat(self):
+        gradients = ScreenGradients(torch.tensor([6.0, 0.0, 5.0]), torch.tensor([3.0, 0.0, 1.0]))
+        assert gradients.mean.tolist() == [2.0, 0.0, 5.0]
+
+
+def fitter(config: FitConfig, parts: PosedParts = DOOR_AND_DRAWER) -> Fitter:
+    capture = photographed(made_of(DOOR.motion(), DRAWER.motion()))
+    return Fitter(capture, config, FitState.start(parts), 0, torch.device("cpu"))
+
+
+QUICK = FitConfig(
+    steps=40,
+    structure_until=4,
+    loose_until=2,
+    image_from=4,
+    structure_size=24,
+    sizes=((0.0, 32),),
+    checkpoint_every=10,
+    join_at=2.0,
+    growth=Growth(interval=8, first=0.2, gradient=1e-5, most=500),
+)
+
+
+class TestOptimiser:
+    def test_is_adam(self):
+        """The same random gradients through `torch.optim.Adam`."""
+        config = replace(QUICK, image_from=0, steps=1000, rates=Rates(final=1.0, appearance_final=1.0))
+        fit = fitter(config)
+        leaves = fit.state.variables.leaves
+        rates = {name: getattr(config.rates, name, config.rates.boxes) for name in leaves}
+        mirror = {name: leaf.detach().clone().requires_grad_() for name, leaf in leaves.items()}
+        reference = torch.optim.Adam([{"params": [mirror[name]], "lr": rates[name]} for name in leaves], eps=1e-15)
+        g = torch.Generator().manual_seed(0)
+        for step in range(12):
+            fit.state.step = step
+            for name, leaf in leaves.items():
+                leaf.grad = torch.randn(leaf.shape, generator=g)
+                mirror[name].grad = leaf.grad.clone()
+            fit._adam()
+            reference.step()
+        for name, leaf in leaves.items():
+            torch.testing.assert_close(leaf, mirror[name], atol=2e-5, rtol=1e-5)
+            first, second = fit.state.moments[name]
+            torch.testing.assert_close(first, reference.state[mirror[name]]["exp_avg"])
+            torch.testing.assert_close(second, reference.state[mirror[name]]["exp_avg_sq"])
+
+    @pytest.mark.parametrize(("name", "final"), [("means", 0.02), ("motions", 0.02), ("box_centres", 0.02), ("sh", 0.2)])
+    def test_rates_fall_by_a_constant_factor_a_step(self, name: str, final: float):
+        """Under a constant gradient Adam's step is the rate."""
+        config = replace(QUICK, image_from=0, steps=10, rates=Rates(final=0.02, appearance_final=0.2))
+        fit = fitter(config)
+        leaf = fit.state.variables.leaves[name]
+        rate = getattr(config.rates, name, config.rates.boxes)
+        for step in range(10):
+            fit.state.step = step
+            before = leaf.detach().clone()
+            leaf.grad = torch.ones_like(leaf)
+            fit._adam()
+            torch.testing.assert_close(
+                before - leaf.detach(), torch.full_like(leaf, rate * final ** (step / 10)), atol=1e-6, rtol=1e-3
+            )
+
+    def test_a_fit_to_its_own_pictures_brings_a_wrong_motion_back(self):
+        off = SE3.exp(torch.tensor([[0.0] * 6, [0.02, -0.02, 0.01, 0.0, 0.03, -0.06], [0.0] * 6]))
+        parts = replace(DOOR_AND_DRAWER, motions=off @ DOOR_AND_DRAWER.motions)
+        still = Rates(*[0.0] * 7, motions=1e-2)
+        growth = Growth(interval=1000)
+        config = replace(
+            QUICK, steps=150, image_from=0, structure_until=0, one_joint_from=1.0, rates=still, growth=growth, alpha_weight=0.0
+        )
+        fit = fitter(config, parts)
+        list(fit.run(150))
+        found = fit.state.variables.motions()[1]
+        error = (DOOR_AND_DRAWER.motions[1].inverse() @ found).angle
+        assert math.degrees(error.item()) < 0.2
+        assert math.degrees(off.angle[1].item()) > 3
+
+    def test_the_type_is_settled_on_the_way_and_the_free_motion_is_kept(self):
+        fit = fitter(replace(QUICK, one_joint_from=0.5))
+        list(fit.run(20))
+        assert fit.state.variables.kinds is None
+        with torch.no_grad():
+            free = fit.state.variables.motions().wxyz_xyz.clone()
+        list(fit.run(21))
+        assert fit.state.variables.kinds == ("revolute", "prismatic")
+        torch.testing.assert_close(fit.state.free_motions, free)
+
+
+class TestCheckpoint:
+    def advanced(self) -> Fitter:
+        fit = fitter(replace(QUICK, one_joint_from=0.4))
+        list(fit.run(18))
+        return fit
+
+    def test_round_trip(self, tmp_path: Path):
+        state = self.advanced().state
+        state.save(tmp_path / "last.pt")
+        again = FitState.load(tmp_path / "last.pt")
+        assert (again.step, again.variables.counts, again.variables.kinds) == (
+            18,
+            state.variables.counts,
+            state.variables.kinds,
+        )
+        assert again.variables.kinds == ("revolute", "prismatic")
+        for name, leaf in state.variables.leaves.items():
+            assert torch.equal(again.variables.leaves[name], leaf)
+            assert again.variables.leaves[name].requires_grad
+            assert all(torch.equal(a, b) for a, b in zip(again.moments[name], state.moments[name], strict=True))
+        assert torch.equal(again.gradients.total, state.gradients.total)
+        assert torch.equal(again.gradients.seen, state.gradients.seen)
+        assert torch.equal(again.free_motions, state.free_motions)
+        assert [file.name for file in tmp_path.iterdir()] == ["last.pt"]
+
+    def test_going_on_from_it_is_the_same_as_not_having_stopped(self, tmp_path: Path):
+        fit = self.advanced()
+        fit.state.save(tmp_path / "last.pt")
+        other = Fitter(fit.capture, fit.config, FitState.load(tmp_path / "last.pt"), 0, torch.device("cpu"))
+        for one in (fit, other):
+            list(one.run(40))
+        assert fit.state.variables.counts == other.state.variables.counts
+        assert sum(other.state.variables.counts) > 360, "splats multiplied on the way"
+        for name, leaf in fit.state.variables.leaves.items():
+            assert torch.equal(other.state.variables.leaves[name], leaf), name
+
+    def test_a_damaged_one_is_named(self, tmp_path: Path):
+        file = tmp_path / "last.pt"
+        FitState.start(DOOR_AND_DRAWER).save(file)
+        whole = file.read_bytes()
+        for damaged in (b"", b"no checkpoint", whole[:1000], whole[: len(whole) // 2]):
+            file.write_bytes(damaged)
+            with pytest.raises(ValueError, match=r"last\.pt: the checkpoint is damaged; delete it to fit this run from"):
+                FitState.load(file)
+
+    @pytest.mark.parametrize("record", [{"step": 3}, [1, 2], {"leaves": [], "counts": 3}])
+    def test_another_program_s_file_is_none(self, tmp_path: Path, record: object):
+        torch.save(record, tmp_path / "last.pt")
+        with pytest.raises(ValueError, match=r"last\.pt: the checkpoint is damaged"):
+            FitState.load(tmp_path / "last.pt")
+
+
+def two_pieces(gap: float, **second: float) -> PosedParts:
+    """Two boxes side by side along x that turn about the z axis through the origin by one radian."""
+    turn = {"angle": 1.0, "lift": 0.0} | second
+    rows = [SE3.identity().wxyz_xyz]
+    for angle, lift in ((1.0, 0.0), (turn["angle"], turn["lift"])):
+        rows.append(SE3.exp(torch.tensor([0.0, 0, lift, 0, 0, angle])).wxyz_xyz)
+    parts = made_of(DOOR.motion(), DOOR.motion(), centres=((0.0, 0, 0), (0.6, 0.0, 0.3), (1.4 + gap, 0.05, 0.3))).parts
+    return replace(parts, motions=SE3(torch.stack(rows)))
+
+
+class TestJoining:
+    def test_joined_parts_hold_the_same_splats_in_both_states(self):
+        parts = two_pieces(0.0)
+        joined = parts.joined(1, 2)
+        assert joined.counts == (120, 240)
+        for state in (0, 1):
+            same_splats(joined.at_state(state), parts.at_state(state))
+        joined = parts.joined(2, 1)
+        order = torch.cat([torch.arange(120), torch.arange(240, 360), torch.arange(120, 240)])
+        for state in (0, 1):
+            same_splats(joined.at_state(state), parts.at_state(state)[order])
+
+    def test_turned_boxes_join_too_and_the_picture_stays(self):
+        parts = turned_parts()
+        joined = parts.joined(2, 1)
+        camera = photographed(made_of(DOOR.motion())).train[0][0].camera
+        before, after = (render(p.at_state(0), camera).rgb for p in (parts, joined))
+        torch.testing.assert_close(after, before, atol=1e-4, rtol=0)
+        same_motion(joined.motions[1], parts.motions[2])
+        assert joined.boxes[1].contains(parts.boxes.corners[1:].reshape(-1, 3), margin=1e-5).all()
+
+    def test_other_parts_are_left_as_they_are(self):
+        parts = made_of(DOOR.motion(), DRAWER.motion(), DOOR.motion(), centres=((0.0, 0, 0),) * 4).parts
+        joined = parts.joined(1, 3)
+        assert joined.counts == (120, 240, 120)
+        same_motion(joined.motions[2], parts.motions[2])
+        same_splats(joined.part_splats(2), parts.part_splats(2))
+
+    def test_parts_that_touch_and_move_alike_are_one(self):
+        assert moving_alike(two_pieces(0.0)) == (1, 2)
+        larger = two_pieces(0.0)
+        counts = (120, 100, 140)
+        assert moving_alike(replace(larger, counts=counts)) == (2, 1), "the larger leads"
+
+    @pytest.mark.parametrize(
+        "parts",
+        [two_pieces(0.5), two_pieces(0.0, angle=0.8), two_pieces(0.0, angle=-1.0), two_pieces(0.0, lift=0.3), DOOR_AND_DRAWER],
+        ids=["apart", "less far", "the other way", "lifted", "a door and a drawer"],
+    )
+    def test_others_are_two(self, parts: PosedParts):
+        assert moving_alike(parts) is None
+
+
+class TestResult:
+    def test_tight_boxes_hold_the_opaque_splats_where_they_were(self):
+        parts = turned_parts()
+        opacities = parts.splats.logit_opacities.clone()
+        opacities[::2] = -3.0
+        means = torch.where((torch.arange(360) % 2 == 0)[:, None], parts.splats.means, 0.5 * parts.splats.means + 0.2)
+        loose = replace(parts, splats=replace(parts.splats, means=means, logit_opacities=opacities))
+        tight = tightened(loose)
+        for state in (0, 1):
+            same_splats(tight.at_state(state), loose.at_state(state))
+        opaque = tight.splats.means[1::2]
+        assert opaque.abs().max() < 1.1
+        assert ((opaque.abs() > 0.95).sum(0) >= 6).all(), "every face is reached, in each of three parts"
+        assert (tight.boxes.half_extents < 0.55 * loose.boxes.half_extents).all()
+
+    def test_a_held_joint_is_no_clearer_than_the_free_motion_was(self):
+        variables = Variables.of(DOOR_AND_DRAWER)
+        variables.hold(["revolute", "prismatic"])
+        state = FitState.start(DOOR_AND_DRAWER)
+        held = replace(state, variables=variables)
+        clear = finished_object(held)
+        odd = held.free_motions.clone()
+        odd[1, 4:] += torch.tensor([0.0, 0.0, 0.5])  # a slide along the hinge, which no joint explains
+        unclear = finished_object(replace(held, free_motions=odd))
+        assert [joint.kind for joint in unclear.joints] == ["revolute", "prismatic"]
+        assert unclear.joints[0].confidence < 0.2 < clear.joints[0].confidence
+        assert unclear.joints[0].review
+        assert unclear.joints[1] == clear.joints[1]
+        assert unclear.joints[0].axis == clear.joints[0].axis
+
+
+RECORD = {"capture": "here", "seed": 0, "fit": {"steps": 3, "sizes": ((0.0, 10),)}}
+
+
+class TestRunFolder:
+    def test_a_new_run_writes_its_configuration(self, tmp_path: Path):
+        RunFolder(tmp_path / "run").begin(RECORD)
+        assert json.loads((tmp_path / "run" / "config.json").read_text())["fit"]["sizes"] == [[0.0, 10]]
+        RunFolder(tmp_path / "run").begin(RECORD)
+
+    def test_another_configuration_is_refused_by_name(self, tmp_path: Path):
+        RunFolder(tmp_path).begin(RECORD)
+        with pytest.raises(
+            ValueError, match=r"a run with another capture, seed lies here; go on with the same or choose another"
+        ):
+            RunFolder(tmp_path).begin(RECORD | {"seed": 1, "capture": "there"})
+        with pytest.raises(ValueError, match=r"a run with another fit lies here"):
+            RunFolder(tmp_path).begin(RECORD | {"fit": {"steps": 4, "sizes": ((0.0, 10),)}})
+
+    def test_a_folder_of_something_else_is_left_alone(self, tmp_path: Path):
+        (tmp_path / "thesis.tex").touch()
+        with pytest.raises(ValueError, match=r"the folder is not empty and holds no run; choose another with -o\.$"):
+            RunFolder(tmp_path).begin(RECORD)
+        assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
+
+    @pytest.mark.parametrize("text", ["", "{", "[1]", "3"])
+    def test_a_damaged_configuration_is_named(self, tmp_path: Path, text: str):
+        (tmp_path / "config.json").write_text(text)
+        with pytest.raises(ValueError, match=r"config\.json: not a configuration"):
+            RunFolder(tmp_path).begin(RECORD)
+
+    def test_records_after_the_checkpoint_and_half_written_ones_go(self, tmp_path: Path):
+        folder = RunFolder(tmp_path)
+        folder.metrics.write_text('{"step": 10}\n{"step": 20}\n{"step": 30}\n{"st')
+        folder.cut_metrics(20)
+        assert folder.metrics.read_text() == '{"step": 10}\n{"step": 20}\n'
+
+    @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+    def test_a_gpu_that_is_not_there(self):
+        assert choose_device("auto") == torch.device("cpu")
+        with pytest.raises(ValueError, match=r"^--device cuda: torch finds no GPU here; use --device cpu"):
+            choose_device("cuda")
+
+
+def test_the_paper_s_preset_has_the_supplement_s_numbers():
+    paper = PRESETS["paper"]
+    assert (paper.steps, paper.splats_per_part, paper.image_from, paper.loose_until) == (10_000, 10_000, 400, 1500)
+    assert (paper.rates.means, paper.rates.boxes, paper.rates.motions) == (1.6e-2, 1e-2, 1e-2)
+    assert (paper.image_weight, paper.ssim_weight, paper.hypotheses) == (10.0, 0.2, False)
