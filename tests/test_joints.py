@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from structuregs.geometry import SE3, Box, Screw
-from structuregs.joints import articulate, constrain, joints_of, kind_of, screw_of_part
+from structuregs.joints import articulate, constrain, joints_of, kind_of, screw_at
 from structuregs.metrics import axis_angle_deg, axis_position
 from structuregs.model import PosedParts, Splats
 
@@ -78,7 +78,7 @@ def test_half_a_turn_has_its_pivot_half_way(axis, dtype):
     """By 180 degrees every point goes to its mirror image: the pivot is the mean of a point's two places."""
     across = torch.linalg.cross(unit(*axis), unit(0.3, 0.5, 0.7)) * 2
     motion = SE3.from_quat(torch.cat([torch.zeros(1, dtype=torch.float64), unit(*axis)]), 2 * across).to(dtype=dtype)
-    screw, q = screw_of_part(motion, "revolute", torch.zeros(3, dtype=dtype))
+    screw, q = screw_at(motion, "revolute", torch.zeros(3, dtype=dtype))
     assert q == pytest.approx(math.pi, abs=1e-6)
     assert torch.allclose(screw.origin, across, atol=1e-6)
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .geometry import SE3, JointKind, Screw, screw_of_motion
+from .geometry import SE3, JointKind, Screw, screw_at
 from .model import ArticulatedObject, Joint, PosedParts
 
 PRISMATIC_BELOW_DEG = 5.0  # supplement 1.4
@@ -40,31 +40,12 @@ def kind_of(motion: SE3) -> JointKind:
     return "prismatic" if math.degrees(float(motion.angle)) < PRISMATIC_BELOW_DEG else "revolute"
 
 
-def screw_of_part(motion: SE3, kind: JointKind, centre: Float[Tensor, " 3"]) -> tuple[Screw, float]:
-    """The screw of a given kind closest to a part's motion and its amount `q >= 0`, in float64.
-
-    The motion is read at the part's centre.  So a slide is the way the part went (the translation of a motion that
-    also turns a little depends on where the world's origin lies), and a turn's origin is the axis's point nearest to
-    the part.
-
-    Args:
-        motion: from state 0 to state 1, in the world.
-        kind: which of the two screws.
-        centre: the centre of the part in state 0, in the world.
-    """
-    centre = centre.double()
-    motion = _double(motion)
-    at_centre = SE3.from_quat(motion.wxyz, motion.apply(centre) - centre)
-    screw, q = screw_of_motion(at_centre, kind)
-    return replace(screw, origin=screw.origin + centre), q
-
-
 def constrain(motion: SE3, kind: JointKind, centre: Float[Tensor, " 3"]) -> SE3:
     """The motion of exactly one degree of freedom that is closest to `motion` at a part's centre, float64.
 
-    Arguments as in `screw_of_part`.
+    Arguments as in `screw_at`.
     """
-    screw, q = screw_of_part(motion, kind, centre)
+    screw, q = screw_at(motion, kind, centre)
     return screw.motion(q)
 
 
@@ -115,7 +96,7 @@ def _double(motion: SE3) -> SE3:
 
 
 def _joint(moved: _Moved, kind: JointKind) -> Joint:
-    screw, q = screw_of_part(moved.motion, kind, moved.centre)
+    screw, q = screw_at(moved.motion, kind, moved.centre)
     scores = [(min(max(score, 0.0), 1.0), sentence) for score, sentence in _scores(moved, screw)]
     lowest, sentence = min(scores)
     (ax, ay, az), (ox, oy, oz) = screw.axis.tolist(), screw.origin.tolist()

@@ -1,6 +1,7 @@
 """Clouds to boxes matched across states, with hypotheses for their motions."""
 
 from .cue import Cluster, CueConfig, StateLook, box_around, clusters
+from .fill import seeded, strewn
 from .partition import MovingPart, SearchConfig
 from .survey import StartConfig, boxes_at_rest, boxes_of_parts, find_parts, survey
 
@@ -16,5 +17,7 @@ __all__ = [
     "boxes_of_parts",
     "clusters",
     "find_parts",
+    "seeded",
+    "strewn",
     "survey",
 ]

@@ -55,7 +55,7 @@ def fit_state(stack: ImageStack, hull: Hull, config: AppearanceConfig, seed: int
     rates = {"means": 0.35 * hull.voxel, "quats": 2e-2, "log_scales": 3e-2, "logit_opacities": 1e-1, "sh": 4e-2}
     optimiser = torch.optim.Adam([{"params": [named[name]], "lr": rate} for name, rate in rates.items()], eps=1e-15)
     order = np.concatenate([generator.permutation(len(stack)) for _ in range(config.steps // len(stack) + 1)])
-    for step, v in enumerate(order[: config.steps]):
+    for step, v in enumerate(order[: config.steps].tolist()):
         for group, rate in zip(optimiser.param_groups, rates.values(), strict=True):
             group["lr"] = rate * 0.1 ** (step / config.steps)
         rgb, alpha = stack.target(v)
@@ -90,7 +90,9 @@ def surface_points(splats: Splats, stack: ImageStack, hull: Hull, looks: int) ->
     held = ((cells >= 0) & (cells < hull.occupied.shape)).all(1)
     held[held] = hull.occupied[tuple(cells[held].T)]
     points, cells = points[held], cells[held]
-    _, group, count = np.unique(np.ravel_multi_index(tuple(cells.T), hull.occupied.shape), return_inverse=True, return_counts=True)
+    _, group, count = np.unique(
+        np.ravel_multi_index(tuple(cells.T), hull.occupied.shape), return_inverse=True, return_counts=True
+    )
     sums = np.stack([np.bincount(group, weights=points[:, axis]) for axis in range(3)], 1)
     return (sums / count[:, None])[count >= 2]
 

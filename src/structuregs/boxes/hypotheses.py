@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from ..geometry import SE3, Box, Screw, screw_of_motion
+from ..geometry import SE3, Box, Screw, screw_at
 from ..points import Hull
 
 _ANGLES = torch.deg2rad(torch.tensor([8.0, *range(15, 181, 15)], dtype=torch.float64))
@@ -133,12 +133,11 @@ def oddity(motion: SE3, box: Box) -> float:
     travel = float((motion.apply(box.corners) - box.corners).square().sum(-1).mean().sqrt())
     total = travel / size
     if float(motion.angle) > np.deg2rad(5):
-        at_centre = SE3.from_quat(motion.wxyz, motion.apply(centre) - centre)
-        screw, _ = screw_of_motion(at_centre, "revolute")
-        line = torch.linspace(-2, 2, 41, dtype=torch.float64)[:, None] * size * screw.axis + screw.origin + centre
+        screw, _ = screw_at(motion, "revolute", centre)
+        line = torch.linspace(-2, 2, 41, dtype=torch.float64)[:, None] * size * screw.axis + screw.origin
         local = box.T_world_box.inverse().apply(line).abs() - box.half_extents
         gap = float(local.clamp(min=0).norm(dim=-1).amin())
-        slide = abs(float(screw.axis @ at_centre.xyz))
+        slide = abs(float(screw.axis @ (motion.apply(centre) - centre)))
         total += min(gap / size, 1.0) + min(slide / size, 1.0)
     return total
 

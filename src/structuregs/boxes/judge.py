@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from ..geometry import SE3, Box
+from ..geometry import SE3, Box, screw_at
 from ..model import Splats
 from ..raster import image_loss, render
 from .cue import StateLook
@@ -21,7 +21,7 @@ class Scene:
     Attributes:
         look: the photos' state.
         rest: splats of all the rest, in the world.
-        views: which photos judge; the first few of them do for a quick look.
+        views: which photos judge; every fourth does for a quick look.
     """
 
     look: StateLook
@@ -39,7 +39,7 @@ class Scene:
     def error(self, part: Splats | None, motion: SE3, quick: bool = False) -> float:
         """Mean error of the judging photos with the part moved."""
         moved = None if part is None else part.moved(motion)
-        return float(np.mean([float(self.loss(moved, int(v))) for v in self.views[:: 2 if quick else 1]]))
+        return float(np.mean([float(self.loss(moved, int(v))) for v in self.views[:: 4 if quick else 1]]))
 
     def judge(self, hypothesis: Hypothesis, part: Splats, quick: bool = False) -> Hypothesis:
         """The hypothesis with its image error."""
@@ -63,13 +63,37 @@ def refine(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, steps: 
     unit = torch.tensor([reach] * 3 + [1.0] * 3)
     tangent = torch.zeros(6, requires_grad=True)
     optimiser = torch.optim.Adam([tangent], lr=rate, betas=(0.8, 0.95))
+    rounds = steps // len(scene.views) + 1
+    order = np.concatenate([np.random.default_rng(turn).permutation(len(scene.views)) for turn in range(rounds)])
     for step in range(steps):
         optimiser.param_groups[0]["lr"] = rate * 0.1 ** (step / steps)
         motion = turn_about(centre, tangent * unit) @ start
-        loss = scene.loss(part.moved(motion), int(scene.views[step % len(scene.views)]))
+        loss = scene.loss(part.moved(motion), int(scene.views[order[step]]))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     motion = (turn_about(centre, (tangent * unit).detach()) @ start).to(dtype=torch.float64)
     moved = replace(hypothesis, motion=motion, oddity=oddity(motion, box))
     return min(scene.judge(hypothesis, part), scene.judge(moved, part), key=lambda h: h.image_error)
+
+
+def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, absent: float) -> Hypothesis:
+    """The hypothesis, or the pure slide or pure turn nearest to it where the photos like that about as well.
+
+    A few photos of a small part hardly tell a slide from a slide with a little turn; joints are one or the other.
+
+    Args:
+        hypothesis: a motion with its image error.
+        scene: the photos, and the rest.
+        part: the part's splats in its own state.
+        box: the part's box in its own state.
+        absent: error of the photos without the part; what the part takes off it is what "about as well" counts in.
+    """
+    motion, centre = hypothesis.motion, box.T_world_box.xyz
+    for kind in ("prismatic", "revolute"):
+        screw, q = screw_at(motion, kind, centre)
+        simple = screw.motion(q)
+        judged = scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
+        if judged.image_error < hypothesis.image_error + 0.2 * max(absent - hypothesis.image_error, 0.0):
+            return judged
+    return hypothesis

@@ -10,7 +10,7 @@ from ..geometry import SE3, Box
 from ..model import Splats
 from .cue import CueConfig, StateLook, box_around, clusters
 from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, hull_scores, oddity, stack_motions
-from .judge import Scene, refine
+from .judge import Scene, refine, simplest
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class SearchConfig:
     """Hypotheses per cluster that pass the hull and are shown to the photos."""
     finalists: int = 5
     """Distinct hypotheses per cluster that the photos pull into place."""
-    looks: int = 8
+    looks: int = 16
     """Photos of the other state that judge the shortlist."""
     steps: int = 40
     """Optimiser steps for each finalist."""
@@ -116,21 +116,18 @@ class PartSearch:
                 continue
             parts.append(part)
             explained |= members | self._explained_by(part)
-        parts = self._reconsider(parts) if len(parts) > 1 else parts
+        if len(parts) > 1:
+            parts = self._settled(self._reconsider(parts))
         return sorted(parts, key=lambda part: -part.gain)[:count]
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
         """Looks at each part again with all others in place; one that may as well move like another becomes one with it."""
         parts = list(parts)
         index = 0
-        while index < len(parts):
+        while index < len(parts) > 1:
             part, others = parts[index], parts[:index] + parts[index + 1 :]
-            state, other = part.state, 1 - part.state
-            box = self._box(part.points)
-            scene = Scene(self.looks[other], self._rest(others, state, other), self._judges(other))
-            absent = scene.error(None, SE3.identity(dtype=torch.float64))
-            splats = self.looks[state].splats
-            piece = splats[self._inside(splats, [box])]
+            state = part.state
+            box, piece, scene, absent = self._again(part, others)
             shared = [p.motion if state == 0 else p.motion.inverse() for p in others]
             starts = [part.hypothesis, *part.rivals[:2], *(Hypothesis(T, 0.0, 0.0, oddity(T, box)) for T in shared)]
             again = [refine(h, scene, piece, box, self.config.steps, self.config.rate) for h in starts]
@@ -143,8 +140,6 @@ class PartSearch:
             if likeness[twin] > self.config.alike:
                 parts = self._merged(others[twin], part, [p for p in others if p is not others[twin]])
                 index = 0
-                if len(parts) == 1:
-                    break
                 continue
             again = by_cost
             chosen = distinct(stack_motions(again), box, 0.1, len(again))
@@ -152,11 +147,31 @@ class PartSearch:
             index += 1
         return parts
 
+    def _again(self, part: MovingPart, others: list[MovingPart]) -> tuple[Box, Splats, Scene, float]:
+        """A part's box and splats, the photos of the other state with all other parts in place, and their error without it."""
+        box = self._box(part.points)
+        other = 1 - part.state
+        scene = Scene(self.looks[other], self._rest(others, part.state), self._judges(other))
+        splats = self.looks[part.state].splats
+        piece = splats[self._inside(splats, [box])]
+        return box, piece, scene, scene.error(None, SE3.identity(dtype=torch.float64))
+
+    def _settled(self, parts: list[MovingPart]) -> list[MovingPart]:
+        """The parts after one longer refinement of each, with the motions of the others as they now are."""
+        parts = list(parts)
+        for index, part in enumerate(parts):
+            box, piece, scene, absent = self._again(part, parts[:index] + parts[index + 1 :])
+            h = refine(part.hypothesis, scene, piece, box, 2 * self.config.steps, self.config.rate)
+            parts[index] = replace(part, hypothesis=simplest(h, scene, piece, box, absent))
+        return parts
+
     def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
         """The parts with two of them made one, which moves as the leader does."""
-        there = follower.points if follower.state == leader.state else leader.hypothesis.motion.inverse().apply(
-            torch.from_numpy(follower.points)
-        ).numpy()
+        there = (
+            follower.points
+            if follower.state == leader.state
+            else leader.hypothesis.motion.inverse().apply(torch.from_numpy(follower.points)).numpy()
+        )
         return [replace(leader, points=np.concatenate([leader.points, there])), *rest]
 
     def _explained_by(self, part: MovingPart) -> set[int]:
@@ -194,7 +209,7 @@ class PartSearch:
             sample = self._sample(self.clusters[i].points, 100)
             fits[i] = hull_scores(motions, sample, target.hull, np.zeros((0, 3)), self.boxes[i])[0] < 0.3
 
-        scene = Scene(target, self._rest(parts, state, other), self._judges(other))
+        scene = Scene(target, self._rest(parts, state), self._judges(other))
         absent = scene.error(None, SE3.identity(dtype=torch.float64))
         judged: list[tuple[Hypothesis, frozenset[int]]] = []
         for m in ranked:
@@ -214,6 +229,7 @@ class PartSearch:
         chosen = distinct(stack_motions([h for h, _ in refined]), box, 0.1, len(refined))
         refined = [refined[c] for c in chosen]
         best, group = refined[0]
+        best = simplest(best, scene, self._piece({index, *group}), box, absent)
         members = {index, *group}
         points = np.concatenate([self.clusters[i].points for i in sorted(members)])
         gain = (absent - best.image_error) / absent
@@ -224,14 +240,14 @@ class PartSearch:
         splats = self.looks[self.clusters[min(members)].state].splats
         return splats[self._inside(splats, [self.boxes[i] for i in sorted(members)])]
 
-    def _rest(self, parts: list[MovingPart], state: int, other: int) -> Splats:
-        """All that stands still in `state`, with the parts found so far as they stand in `other`."""
+    def _rest(self, parts: list[MovingPart], state: int) -> Splats:
+        """All that stands still in `state`, with the parts found so far as they stand in the other state."""
         splats = self.looks[state].splats
         moving = self._inside(splats, [b for c, b in zip(self.clusters, self.boxes, strict=True) if c.state == state])
-        return Splats.concatenate([splats[~moving], *self._placed(parts, state, other)])
+        return Splats.concatenate([splats[~moving], *self._placed(parts, state)])
 
-    def _placed(self, parts: list[MovingPart], state: int, other: int) -> list[Splats]:
-        """Splats of the parts found so far, as they stand in state `other`, taken from the state that shows them."""
+    def _placed(self, parts: list[MovingPart], state: int) -> list[Splats]:
+        """Splats of the parts found so far as they stand in the state other than `state`, each from the one that shows it."""
         rows = []
         for part in parts:
             source = self.looks[part.state].splats

@@ -62,15 +62,20 @@ def boxes_of_parts(looks: tuple[StateLook, StateLook], parts: list[MovingPart], 
     """Boxes in state 0 and motions (K of each, float32, the base first) of the parts that a search found."""
     by = config.margin * looks[0].hull.voxel
     moving = [_grown(part.points_in(0), by) for part in parts]
-    still = []
-    for state, look in enumerate(looks):
-        points = torch.from_numpy(look.points)
-        free = torch.ones(len(points), dtype=torch.bool)
-        for box, part in zip(moving, parts, strict=True):
-            free &= ~(box.moved(part.motion) if state else box).contains(points)
-        still.append(points[free].numpy())
-    boxes = [_grown(np.concatenate(still), by), *moving]
-    return _stacked(boxes, [SE3.identity(dtype=torch.float64), *(part.motion for part in parts)])
+    posed = [(box, box.moved(part.motion)) for box, part in zip(moving, parts, strict=True)]
+    still = _grown(_still_points(looks, posed), by)
+    return _stacked([still, *moving], [SE3.identity(dtype=torch.float64), *(part.motion for part in parts)])
+
+
+def _still_points(looks: tuple[StateLook, StateLook], moving: list[tuple[Box, Box]]) -> Float64[np.ndarray, "P 3"]:
+    """What stands in the hulls of both states, outside the moving boxes, which are given as they lie in either state."""
+    hull = looks[0].hull
+    points = torch.from_numpy(hull.centres(hull.occupied & looks[1].hull.occupied))
+    free = torch.ones(len(points), dtype=torch.bool)
+    for pair in moving:
+        for box in pair:
+            free &= ~box.contains(points)
+    return points[free if free.any() else slice(None)].numpy()
 
 
 def boxes_at_rest(looks: tuple[StateLook, StateLook], count: int | None, config: StartConfig) -> tuple[Box, SE3]:
@@ -87,11 +92,7 @@ def boxes_at_rest(looks: tuple[StateLook, StateLook], count: int | None, config:
     found = clusters(looks, config.search.cue)
     chosen = [c for c in found if c.state == 0] or found
     moving = [_grown(c.points, by) for c in chosen[:count]]
-    points = torch.from_numpy(looks[0].points)
-    free = torch.ones(len(points), dtype=torch.bool)
-    for box in moving:
-        free &= ~box.contains(points)
-    boxes = [_grown(points[free].numpy(), by), *moving]
+    boxes = [_grown(_still_points(looks, [(box, box) for box in moving]), by), *moving]
     return _stacked(boxes, [SE3.identity(dtype=torch.float64)] * len(boxes))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from ..boxes import boxes_at_rest, boxes_of_parts, find_parts, survey
+from ..boxes import boxes_at_rest, boxes_of_parts, find_parts, seeded, strewn, survey
 from ..capture import Capture
 from ..geometry import SE3, Box
 from ..joints import articulate, joints_of
@@ -16,7 +16,6 @@ from ..model import ArticulatedObject, PosedParts, load_object, save_object
 from .events import Finished, FitEvent, Note, StageStarted, Step
 from .loop import FitState, Fitter
 from .schedule import PRESETS, FitConfig
-from .variables import strewn
 
 
 @dataclass(frozen=True)
@@ -66,6 +65,8 @@ class RunFolder:
             before = json.loads(self.config.read_text())
         except json.JSONDecodeError as error:
             raise ValueError(f"{self.config}: not a configuration ({error}); choose another folder with -o.") from error
+        if not isinstance(before, dict):
+            raise ValueError(f"{self.config}: not a configuration (no JSON object); choose another folder with -o.")
         changed = [key for key in sorted(record.keys() | before.keys()) if _plain(record.get(key)) != before.get(key)]
         if changed:
             raise ValueError(
@@ -114,22 +115,22 @@ def start_parts(
     yield StageStarted("look", 2)
     looks = survey(capture, points, config.start, seed)
     yield Step("look", 2, 0.0, None, sum(len(look.splats) for look in looks))
+    generator = torch.Generator().manual_seed(seed)
+    filling = (config.splats_per_part, config.sh_degree, generator)
     if config.hypotheses:
         yield StageStarted("search", 1)
         found = find_parts(looks, parts, config.start, seed)
         boxes, motions = boxes_of_parts(looks, found, config.start)
-        yield Step("search", 1, 0.0, None, 0)
+        posed = seeded(boxes, motions, looks, found, *filling)
+        yield Step("search", 1, 0.0, None, sum(posed.counts))
     else:
         boxes, motions = boxes_at_rest(looks, parts, config.start)
-    count = len(boxes.half_extents) - 1
+        posed = strewn(boxes, motions, *filling, looks[0].splats.base_rgb.mean(0))
+    count = len(posed) - 1
     yield Note(f"{count} moving part{'' if count == 1 else 's'} found")
     if parts is not None and count != parts:
         yield Note(f"{parts} were asked for: what else moves does not show in masks and photos")
-    stack = looks[0].stack
-    solid = stack.alpha > 250
-    rgb = torch.from_numpy(stack.rgb[solid].mean(0) / 255).float()
-    generator = torch.Generator().manual_seed(seed)
-    yield strewn(boxes, motions, config.splats_per_part, config.sh_degree, generator, rgb)
+    yield posed
 
 
 def tightened(parts: PosedParts) -> PosedParts:

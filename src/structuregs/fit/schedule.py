@@ -63,8 +63,8 @@ class FitConfig:
     """Optimiser steps, each with one view of either state."""
     hypotheses: bool = True
     """Search each part's motion before the fit; otherwise start from rest, as in the supplement."""
-    splats_per_part: int = 6000
-    """Splats strewn in each box at the start (supplement: 10,000)."""
+    splats_per_part: int = 2000
+    """Splats strewn in each box at the start (supplement: 10,000, and nothing else to start from)."""
     sh_degree: int = 0
     """Degree of the spherical harmonics."""
     structure_until: int = 150
@@ -117,7 +117,9 @@ PRESETS: dict[str, FitConfig] = {
         tint_penalty=0.0,
         one_joint_from=1.0,
         checkpoint_every=500,
-        rates=Rates(quats=1e-3, log_scales=5e-3, sh=2.5e-3, tint=0.0, boxes=1e-2, motions=1e-2, final=1.0, appearance_final=1.0),
+        rates=Rates(
+            quats=1e-3, log_scales=5e-3, sh=2.5e-3, tint=0.0, boxes=1e-2, motions=1e-2, final=1.0, appearance_final=1.0
+        ),
         growth=Growth(first=0.05, last=0.5, reset=3000),
     ),
 }

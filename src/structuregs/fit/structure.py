@@ -101,7 +101,7 @@ def structure_loss(
     boxes: Box,
     motions: SE3,
     cameras: tuple[Camera, Camera],
-    masks: tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]],
+    masks: tuple[Float[Tensor, "H0 W0"], Float[Tensor, "H1 W1"]],
     weights: StructureWeights,
     softness: float,
     loose: bool,

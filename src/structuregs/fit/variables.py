@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..geometry import SE3, Box, JointKind
-from ..joints import screw_of_part
-from ..model import SH_C0, PosedParts, Splats
+from ..geometry import SE3, Box, JointKind, screw_at
+from ..model import PosedParts, Splats
 
 SPLAT_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh", "tint")
 
@@ -84,33 +83,12 @@ class Variables:
         with torch.no_grad():
             motions, boxes = self.motions(), self.boxes()
             for k, kind in enumerate(kinds, start=1):
-                screw, q = screw_of_part(motions[k], kind, boxes.T_world_box.xyz[k])
+                screw, q = screw_at(motions[k], kind, boxes.T_world_box.xyz[k])
                 rows[k, :3] = screw.axis.to(rows) * q
                 if kind == "revolute":
                     rows[k, 3:] = screw.origin.to(rows)
             self.leaves["motions"].copy_(rows)
         self.kinds = tuple(kinds)
-
-
-def strewn(
-    boxes: Box, motions: SE3, per_part: int, sh_degree: int, generator: torch.Generator, rgb: Float[Tensor, " 3"]
-) -> PosedParts:
-    """Parts whose boxes are evenly strewn with faint splats of one colour (supplement 1.1: uniform in [-1, 1]^3)."""
-    K = len(boxes.half_extents)
-    means = torch.rand(K * per_part, 3, generator=generator) * 2 - 1
-    # Each splat about as large as its share of the box.
-    spacing = (boxes.volume / per_part) ** (1 / 3)
-    log_scales = (0.5 * spacing).log().repeat_interleave(per_part)[:, None].expand(-1, 3)
-    sh = torch.zeros(K * per_part, (sh_degree + 1) ** 2, 3)
-    sh[:, 0] = (rgb - 0.5) / SH_C0
-    splats = Splats(
-        means,
-        torch.tensor([1.0, 0, 0, 0]).repeat(K * per_part, 1),
-        log_scales.contiguous().float(),
-        torch.full((K * per_part,), -2.2),
-        sh,
-    )
-    return PosedParts(boxes, motions, splats, (per_part,) * K, torch.zeros(K * per_part, 3))
 
 
 def part_index(counts: tuple[int, ...], device: torch.device) -> Int[Tensor, " N"]:

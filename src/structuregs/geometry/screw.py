@@ -1,7 +1,7 @@
 """Screws: the axis, pivot and amount of a rigid motion."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -55,3 +55,22 @@ def screw_of_motion(T: SE3, kind: JointKind) -> tuple[Screw, float]:
     cot = math.cos(angle / 2) / max(math.sin(angle / 2), 1e-12)
     origin = 0.5 * (across + cot * torch.linalg.cross(axis, across))
     return Screw("revolute", axis, origin), angle
+
+
+def screw_at(motion: SE3, kind: JointKind, centre: Float[Tensor, " 3"]) -> tuple[Screw, float]:
+    """The screw of a given kind closest to a part's motion and its amount `q >= 0`, in float64.
+
+    The motion is read at the part's centre.  So a slide is the way the part went (the translation of a motion that
+    also turns a little depends on where the world's origin lies), and a turn's origin is the axis's point nearest to
+    the part.
+
+    Args:
+        motion: from state 0 to state 1, in the world.
+        kind: which of the two screws.
+        centre: the centre of the part in state 0, in the world.
+    """
+    centre = centre.double()
+    motion = SE3.from_quat(motion.wxyz.double(), motion.xyz.double())
+    at_centre = SE3.from_quat(motion.wxyz, motion.apply(centre) - centre)
+    screw, q = screw_of_motion(at_centre, kind)
+    return replace(screw, origin=screw.origin + centre), q

@@ -57,7 +57,9 @@ class Splats:
     def moved(self, T: SE3) -> "Splats":
         """The same splats after a rigid motion."""
         T = T.to(dtype=self.means.dtype)
-        return replace(self, means=T.apply(self.means), quats=quat_multiply(T.wxyz, self.quats), sh=rotate_sh(self.sh, T.rotation))
+        return replace(
+            self, means=T.apply(self.means), quats=quat_multiply(T.wxyz, self.quats), sh=rotate_sh(self.sh, T.rotation)
+        )
 
     def __getitem__(self, index: slice | Tensor) -> "Splats":
         """The splats that an index, a mask or a slice selects."""
