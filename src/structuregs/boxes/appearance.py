@@ -30,7 +30,7 @@ class AppearanceConfig:
 
 def _start(hull: Hull, count: int, generator: np.random.Generator) -> Splats:
     """Splats strewn over the hull, half of them in its outermost layer of voxels."""
-    shell = hull.occupied & ~ndimage.binary_erosion(hull.occupied)
+    shell = hull.occupied & np.logical_not(ndimage.binary_erosion(hull.occupied))
     centres = []
     for chosen in (hull.occupied, shell):
         cells = hull.centres(chosen)
@@ -87,7 +87,7 @@ def surface_points(splats: Splats, stack: ImageStack, hull: Hull, looks: int) ->
         hits.append((origin + rays * picture.depth[..., None])[clear])
     points = torch.cat(hits).double().numpy()
     cells = np.floor((points - hull.origin) / hull.voxel).astype(np.int64)
-    held = ((cells >= 0) & (cells < hull.occupied.shape)).all(1)
+    held = np.all((cells >= 0) & (cells < hull.occupied.shape), axis=1)
     held[held] = hull.occupied[tuple(cells[held].T)]
     points, cells = points[held], cells[held]
     _, group, count = np.unique(

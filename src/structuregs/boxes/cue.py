@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Bool, Float64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from sklearn.cluster import DBSCAN
 
 from ..capture import ImageStack
@@ -68,7 +68,7 @@ def moving_points(points: Float64[np.ndarray, "P 3"], other: StateLook, threshol
     carved = other.hull.sample(other.hull.distance(), points, outside=np.inf) > threshold
     if not len(other.points):
         return carved
-    return carved & (cKDTree(other.points).query(points, distance_upper_bound=2 * threshold)[0] > threshold)
+    return carved & (KDTree(other.points).query(points, distance_upper_bound=2 * threshold)[0] > threshold)
 
 
 def clusters(looks: tuple[StateLook, StateLook], config: CueConfig) -> list[Cluster]:
