@@ -15,7 +15,7 @@ test: install
 	$(BIN)/pytest
 
 bench: install
-	$(BIN)/python -m benchmarks
+	$(BIN)/python benchmarks/raster.py
 
 install: $(INSTALLED)
 

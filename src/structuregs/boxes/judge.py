@@ -13,6 +13,8 @@ from ..raster import image_loss, render
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
+NOISE = 0.002  # fraction of the photo error below which a difference says nothing
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -94,6 +96,6 @@ def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, absen
         screw, q = screw_at(motion, kind, centre)
         simple = screw.motion(q)
         judged = scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
-        if judged.image_error < hypothesis.image_error + 0.2 * max(absent - hypothesis.image_error, 0.0):
+        if judged.image_error < hypothesis.image_error + 0.2 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent:
             return judged
     return hypothesis

@@ -10,7 +10,7 @@ from ..geometry import SE3, Box
 from ..model import Splats
 from .cue import CueConfig, StateLook, box_around, clusters
 from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, hull_scores, oddity, stack_motions
-from .judge import Scene, refine, simplest
+from .judge import NOISE, Scene, refine, simplest
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class SearchConfig:
     """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
     alike: float = 0.75
     """...and if moving it like the other takes this fraction of the best gain off the photo error."""
-    worth: float = 0.002
-    """A part is kept if it takes at least this fraction off the other state's photo error."""
+    large: float = 0.03
+    """A part need not do more than no harm to the photos if it holds this fraction of its state's points."""
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,15 @@ class PartSearch:
         return np.unique(np.linspace(0, count - 1, min(self.config.looks, count)).round().astype(int))
 
     def search(self, count: int | None) -> list[MovingPart]:
-        """The moving parts with the motions that the photos prefer: all that are worth it, or the `count` best."""
+        """The moving parts with the motions that the photos prefer: all that explain something, or the `count` best."""
         parts: list[MovingPart] = []
         explained: set[int] = set()
         for index in range(len(self.clusters)):
             if index in explained:
                 continue
             part, members = self._try(index, parts, explained)
-            if part.gain < self.config.worth:
+            share = len(part.points) / len(self.looks[part.state].points)
+            if part.gain < (0.0 if share > self.config.large else NOISE):
                 continue
             parts.append(part)
             explained |= members | self._explained_by(part)

@@ -181,7 +181,7 @@ class Fitter:
         motions = parts.motions if self.config.motions_with_structure else SE3(parts.motions.wxyz_xyz.detach())
         loose = self.state.step < self.config.loose_until
         return structure_loss(
-            parts.boxes, motions, cameras, (masks[0], masks[1]), StructureWeights(), softness=0.02 * self.size, loose=loose
+            parts.boxes, motions, cameras, (masks[0], masks[1]), StructureWeights(), softness=0.01 * self.size, loose=loose
         )
 
     def _image_loss(self, parts: PosedParts) -> tuple[Tensor, list, float | None]:
@@ -209,12 +209,13 @@ class Fitter:
         """The learning rate of a leaf in this step."""
         rates, config = self.config.rates, self.config
         done = max(0, self.state.step - config.image_from) / max(1, config.steps - config.image_from)
-        if name in _BOX_NAMES:
-            return rates.boxes * rates.final**done
+        if name in _BOX_NAMES:  # without the losses on boxes only splats and motions have something to explain
+            return rates.boxes * rates.final**done if self.state.step < config.structure_until else 0.0
         if name == "motions" and self.state.step < config.image_from and not config.motions_with_structure:
             return 0.0
         final = rates.final if name in ("means", "motions") else rates.appearance_final
-        return getattr(rates, name) * final**done
+        held = name in SPLAT_NAMES and self.state.step < config.image_from + config.motions_first
+        return getattr(rates, name) * final**done * (0.1 if held else 1.0)
 
     @torch.no_grad()
     def _adam(self) -> None:

@@ -35,7 +35,7 @@ class Rates:
 class Growth:
     """Densification and pruning, as in 3DGS."""
 
-    first: float = 0.1
+    first: float = 0.2
     """Part of the fit after which splats begin to multiply."""
     last: float = 0.7
     """Part of the fit after which they no longer do."""
@@ -45,7 +45,7 @@ class Growth:
     """Mean screen-space gradient (in half image sizes) above which a splat is cloned or split."""
     small: float = 0.01
     """Splats smaller than this (times the object's size) are cloned, larger ones split."""
-    most: int = 40_000
+    most: int = 25_000
     """No more splats than this."""
     faint: float = 0.005
     """Splats of lower opacity go."""
@@ -59,11 +59,11 @@ class Growth:
 class FitConfig:
     """The whole fit.  Parts of the fit are fractions of `steps`."""
 
-    steps: int = 1800
+    steps: int = 1400
     """Optimiser steps, each with one view of either state."""
     hypotheses: bool = True
     """Search each part's motion before the fit; otherwise start from rest, as in the supplement."""
-    splats_per_part: int = 2000
+    splats_per_part: int = 1000
     """Splats strewn in each box at the start (supplement: 10,000, and nothing else to start from)."""
     sh_degree: int = 0
     """Degree of the spherical harmonics."""
@@ -73,11 +73,13 @@ class FitConfig:
     """Step at which contact and extent end."""
     image_from: int = 150
     """Step at which the image loss begins."""
+    motions_first: int = 150
+    """Steps with images during which splats hardly change, so that what does not fit moves the parts."""
     structure_size: int = 96
     """Size of the structure images: the side of a square with as many pixels."""
     motions_with_structure: bool = False
     """Whether the losses on boxes move the motions too."""
-    sizes: tuple[tuple[float, int], ...] = ((0.0, 200), (0.5, 400), (0.85, 800))
+    sizes: tuple[tuple[float, int], ...] = ((0.0, 160), (0.35, 256), (0.65, 400), (0.92, 800))
     """(part of the fit, size) from which on images have that size, cropped to the object; never more than they have."""
     image_weight: float = 10.0
     """Of the image loss."""
@@ -85,7 +87,7 @@ class FitConfig:
     """Share of D-SSIM in the image loss."""
     alpha_weight: float = 0.5
     """Of the mask's error beside the colour's."""
-    tint_penalty: float = 0.02
+    tint_penalty: float = 0.3
     """Of the mean absolute colour difference between the states."""
     join_at: float = 0.35
     """Part of the fit after which parts that touch and move alike are made one."""
@@ -111,6 +113,7 @@ PRESETS: dict[str, FitConfig] = {
         structure_until=10_000,
         loose_until=1500,
         image_from=400,
+        motions_first=0,
         motions_with_structure=True,
         sizes=((0.0, 1600),),
         alpha_weight=0.0,
