@@ -25,6 +25,8 @@ class CueConfig:
     """Moving points closer than this belong together (DBSCAN's eps)."""
     neighbours: int = 6
     """Points within `link` that make a point dense (DBSCAN's min_samples)."""
+    hollow: float = 0.65
+    """A cluster is cut in two where the boxes of the pieces together have less than this share of its box's volume."""
     smallest: float = 0.004
     """Clusters below this fraction of a state's points are dropped as noise."""
 
@@ -82,10 +84,39 @@ def clusters(looks: tuple[StateLook, StateLook], config: CueConfig) -> list[Clus
             continue
         labels = DBSCAN(eps=config.link * voxel, min_samples=config.neighbours).fit_predict(moving)
         for label in range(labels.max() + 1):
-            members = moving[labels == label]
-            if len(members) >= max(config.smallest * len(look.points), 2 * config.neighbours):
-                found.append(Cluster(state, members))
+            least = max(config.smallest * len(look.points), 2.0 * config.neighbours)
+            pieces = split_where_hollow(moving[labels == label], 0.5 * voxel, config.hollow)
+            found += [Cluster(state, piece) for piece in pieces if len(piece) >= least]
     return sorted(found, key=lambda cluster: -len(cluster.points))
+
+
+def split_where_hollow(points: Float64[np.ndarray, "P 3"], thinnest: float, ratio: float) -> list[Float64[np.ndarray, "_ 3"]]:
+    """The points, cut by planes across their box's axes for as long as that makes the boxes much smaller.
+
+    Two parts that touch in the state where both are open are one cluster; but no one box fits them well.  A single part cut
+    in two by mistake is mended later, as both pieces move alike.
+
+    Args:
+        points: in the world.
+        thinnest: smallest half extent of a box, world units.
+        ratio: cut if the pieces' boxes have less than this share of the volume.
+    """
+    generator = np.random.default_rng(0)
+    sample = points if len(points) <= 600 else points[generator.choice(len(points), 600, replace=False)]
+    box = box_around(sample, thinnest, trim=0.01)
+    local = (sample - box.T_world_box.xyz.numpy()) @ box.T_world_box.rotation.numpy()
+    best, cut = ratio * float(box.volume), None
+    for axis in range(3):
+        for level in np.quantile(local[:, axis], np.linspace(0.15, 0.85, 15)):
+            low = local[:, axis] < level
+            if 30 <= low.sum() <= len(low) - 30:
+                volume = sum(float(box_around(sample[side], thinnest, trim=0.01).volume) for side in (low, ~low))
+                if volume < best:
+                    best, cut = volume, (axis, level)
+    if cut is None:
+        return [points]
+    low = ((points - box.T_world_box.xyz.numpy()) @ box.T_world_box.rotation.numpy())[:, cut[0]] < cut[1]
+    return [piece for side in (low, ~low) for piece in split_where_hollow(points[side], thinnest, ratio)]
 
 
 def box_around(points: Float64[np.ndarray, "P 3"], thinnest: float, trim: float = 0.002) -> Box:

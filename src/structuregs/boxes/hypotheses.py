@@ -39,21 +39,28 @@ class Hypothesis:
     image_error: float = float("inf")
 
     def cost(self, gain: float) -> float:
-        """What hypotheses are compared by: the image error, raised where the motion leaves the hull or is unlike a joint's.
+        """What hypotheses are compared by: the image error, raised for what else speaks against the motion.
 
         Light that stays in the world while a part turns can make a mirrored pose look better than the true one; therefore
-        what is odd about a motion counts as a share of `gain`, the most that any hypothesis takes off the error.
+        what is odd about a motion, and what the masks say, count as shares of `gain`, the most that any hypothesis takes off
+        the error.
         """
-        return self.image_error + gain * (0.2 * self.oddity + 0.2 * min(self.outside, 1.0))
+        against = 0.2 * self.oddity + 0.2 * min(self.outside, 1.0) + 0.3 * self.unexplained
+        return self.image_error + gain * against
 
 
 def hinge_screws(box: Box) -> list[Screw]:
-    """Turns about lines along the box's axes: its edges, the mid-lines of its faces and of itself."""
+    """Turns about lines along the box's axes: its edges, the mid-lines of its faces and of itself, and lines a little beyond.
+
+    Near its hinge a part hardly moves, so that what is seen to move, and its box, end before the hinge.
+    """
     screws = []
     R, centre, h = box.T_world_box.rotation, box.T_world_box.xyz, box.half_extents
     for axis in range(3):
         b, c = (axis + 1) % 3, (axis + 2) % 3
-        for i, j in itertools.product((-1, 0, 1), repeat=2):
+        for i, j in itertools.product((-1.3, -1, 0, 1, 1.3), repeat=2):
+            if abs(i) > 1 and abs(j) > 1:
+                continue
             screws.append(Screw("revolute", R[:, axis], centre + R[:, b] * h[b] * i + R[:, c] * h[c] * j))
     return screws
 

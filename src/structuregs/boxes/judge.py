@@ -79,23 +79,33 @@ def refine(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, steps: 
     return min(scene.judge(hypothesis, part), scene.judge(moved, part), key=lambda h: h.image_error)
 
 
-def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, absent: float) -> Hypothesis:
-    """The hypothesis, or the pure slide or pure turn nearest to it where the photos like that about as well.
+def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, base: Box, absent: float) -> Hypothesis:
+    """The hypothesis, or the simplest motion near it that the photos like about as well.
 
-    A few photos of a small part hardly tell a slide from a slide with a little turn; joints are one or the other.
+    A few photos of a small part hardly tell a slide from a slide with a little turn, or one along the box from one a little
+    askew; joints are built along boxes, and they turn or slide.  Tried in turn: the slide along an axis of the box or the
+    base, the slide, the turn.
 
     Args:
         hypothesis: a motion with its image error.
         scene: the photos, and the rest.
         part: the part's splats in its own state.
         box: the part's box in its own state.
+        base: the base's box.
         absent: error of the photos without the part; what the part takes off it is what "about as well" counts in.
     """
     motion, centre = hypothesis.motion, box.T_world_box.xyz
-    for kind in ("prismatic", "revolute"):
-        screw, q = screw_at(motion, kind, centre)
-        simple = screw.motion(q)
+    slide, length = screw_at(motion, "prismatic", centre)
+    axes = torch.cat([box.T_world_box.rotation.T, base.T_world_box.rotation.T])
+    along = axes @ slide.axis
+    nearest = int(along.abs().argmax())
+    turn, angle = screw_at(motion, "revolute", centre)
+    candidates = [slide.motion(length), turn.motion(angle)]
+    if abs(float(along[nearest])) > np.cos(np.deg2rad(15)):
+        candidates.insert(0, replace(slide, axis=axes[nearest]).motion(length * float(along[nearest])))
+    enough = hypothesis.image_error + 0.2 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent
+    for simple in candidates:
         judged = scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
-        if judged.image_error < hypothesis.image_error + 0.2 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent:
+        if judged.image_error < enough:
             return judged
     return hypothesis

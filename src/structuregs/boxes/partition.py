@@ -130,7 +130,9 @@ class PartSearch:
             state = part.state
             box, piece, scene, absent = self._again(part, others)
             shared = [p.motion if state == 0 else p.motion.inverse() for p in others]
-            starts = [part.hypothesis, *part.rivals[:2], *(Hypothesis(T, 0.0, 0.0, oddity(T, box)) for T in shared)]
+            own = part.hypothesis
+            guests = [replace(own, motion=T, oddity=oddity(T, box)) for T in shared]
+            starts = [own, *part.rivals[:2], *guests]
             again = [refine(h, scene, piece, box, self.config.steps, self.config.rate) for h in starts]
             gains = [absent - h.image_error for h in again]
             most = max(*gains, 1e-12)
@@ -163,7 +165,7 @@ class PartSearch:
         for index, part in enumerate(parts):
             box, piece, scene, absent = self._again(part, parts[:index] + parts[index + 1 :])
             h = refine(part.hypothesis, scene, piece, box, 2 * self.config.steps, self.config.rate)
-            parts[index] = replace(part, hypothesis=simplest(h, scene, piece, box, absent))
+            parts[index] = replace(part, hypothesis=simplest(h, scene, piece, box, self.base_box, absent))
         return parts
 
     def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
@@ -230,7 +232,7 @@ class PartSearch:
         chosen = distinct(stack_motions([h for h, _ in refined]), box, 0.1, len(refined))
         refined = [refined[c] for c in chosen]
         best, group = refined[0]
-        best = simplest(best, scene, self._piece({index, *group}), box, absent)
+        best = simplest(best, scene, self._piece({index, *group}), box, self.base_box, absent)
         members = {index, *group}
         points = np.concatenate([self.clusters[i].points for i in sorted(members)])
         gain = (absent - best.image_error) / absent

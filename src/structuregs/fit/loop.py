@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..capture import Capture, ImageStack, stack_views
-from ..geometry import SE3
+from ..geometry import SE3, JointKind
 from ..joints import kind_of
 from ..model import PosedParts
 from ..raster import image_loss, render
@@ -137,7 +137,7 @@ class Fitter:
             with torch.no_grad():
                 motions = variables.motions()
             self.state.free_motions = motions.wxyz_xyz
-            kinds = [kind_of(motions[k]) for k in range(1, len(variables.counts))]
+            kinds: list[JointKind] = [kind_of(motions[k]) for k in range(1, len(variables.counts))]
             variables.hold(kinds)
             first, second = self.state.moments["motions"]
             self.state.moments["motions"] = (torch.zeros_like(first), torch.zeros_like(second))
