@@ -117,13 +117,13 @@ def demo(run: NewRun = Path("runs/demo")) -> None:
 
 def _make_known(capture: Path) -> Path:
     """Makes the demo's capture where it is not there yet, aside and then into place; the folder of its truth."""
-    from .synthetic import make_capture, make_object, save_known
+    from .synthetic import RenderOptions, make_capture, make_object, save_known
 
     if not capture.exists():
         print(f"making a capture of a cabinet with a door and a drawer in {capture}")
         cabinet = make_object("cabinet")
         staged = capture.with_name("capture.part")
-        save_known(cabinet, make_capture(cabinet), staged, "artgs")
+        save_known(cabinet, make_capture(cabinet, RenderOptions(size=256, views=40)), staged, "artgs")
         staged.replace(capture)
     return capture / "gt"
 
@@ -176,6 +176,8 @@ def _follow(events: "Iterable[FitEvent]") -> "Finished":
 
 
 def _figures(step: "Step") -> str:
+    if step.loss is None:
+        return ""
     psnr = "" if step.psnr is None else f"  PSNR {step.psnr:.1f}"
     return f"loss {step.loss:.4f}{psnr}  {step.splats} splats"
 

@@ -2,13 +2,14 @@
 
 from .cue import Cluster, CueConfig, StateLook, box_around, clusters
 from .fill import seeded, strewn
-from .partition import MovingPart, SearchConfig
-from .survey import StartConfig, boxes_at_rest, boxes_of_parts, find_parts, survey
+from .partition import MovingPart, PartSearch, SearchConfig
+from .survey import StartConfig, boxes_at_rest, boxes_of_parts, find_parts, look_at_states, survey
 
 __all__ = [
     "Cluster",
     "CueConfig",
     "MovingPart",
+    "PartSearch",
     "SearchConfig",
     "StartConfig",
     "StateLook",
@@ -17,6 +18,7 @@ __all__ = [
     "boxes_of_parts",
     "clusters",
     "find_parts",
+    "look_at_states",
     "seeded",
     "strewn",
     "survey",

@@ -1,5 +1,6 @@
 """From clusters of what moved to moving parts: each a box in state 0 and the motion that the photos like best."""
 
+from collections.abc import Generator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -106,9 +107,19 @@ class PartSearch:
 
     def search(self, count: int | None) -> list[MovingPart]:
         """The moving parts with the motions that the photos prefer: all that explain something, or the `count` best."""
+        steps = self.steps()
+        while True:
+            try:
+                next(steps)
+            except StopIteration as done:
+                return done.value[:count]
+
+    def steps(self) -> Generator[int, None, list[MovingPart]]:
+        """The search, bit by bit: yields how many clusters are done with, and returns the parts, the best first."""
         parts: list[MovingPart] = []
         explained: set[int] = set()
         for index in range(len(self.clusters)):
+            yield index
             if index in explained:
                 continue
             part, members = self._try(index, parts, explained)
@@ -119,7 +130,7 @@ class PartSearch:
             explained |= members | self._explained_by(part)
         if len(parts) > 1:
             parts = self._settled(self._reconsider(parts))
-        return sorted(parts, key=lambda part: -part.gain)[:count]
+        return sorted(parts, key=lambda part: -part.gain)
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
         """Looks at each part again with all others in place; one that may as well move like another becomes one with it."""

@@ -1,5 +1,6 @@
 """From a capture to a look at each state, and from moving parts to boxes with their motions."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,8 +31,8 @@ class StartConfig:
     """The search for motions."""
 
 
-def survey(capture: Capture, source: str, config: StartConfig, seed: int) -> tuple[StateLook, StateLook]:
-    """Hull, quick look and surface points of both states.
+def look_at_states(capture: Capture, source: str, config: StartConfig, seed: int) -> Iterator[StateLook]:
+    """Hull, quick look and surface points of state 0, then of state 1.
 
     Args:
         capture: its training views are used.
@@ -43,14 +44,18 @@ def survey(capture: Capture, source: str, config: StartConfig, seed: int) -> tup
     silhouettes = tuple(Silhouettes(stack.cameras, stack.alpha.astype(np.float32) / 255) for stack in stacks)
     low, high = object_bounds(silhouettes)
     given = points_from(capture, source)
-    looks = []
     for state, views in enumerate(capture.train):
         hull = silhouettes[state].carve(low, high, config.voxels)
         stack = stack_views(views, config.appearance.size)
         splats = fit_state(stack, hull, config.appearance, seed)
         points = given[state] if given else surface_points(splats, stack, hull, config.appearance.looks)
-        looks.append(StateLook(stack, hull, points, splats))
-    return looks[0], looks[1]
+        yield StateLook(stack, hull, points, splats)
+
+
+def survey(capture: Capture, source: str, config: StartConfig, seed: int) -> tuple[StateLook, StateLook]:
+    """Both of `look_at_states`, with its arguments."""
+    first, second = look_at_states(capture, source, config, seed)
+    return first, second
 
 
 def _grown(points: Float64[np.ndarray, "P 3"], by: float) -> Box:

@@ -26,14 +26,14 @@ class Step:
     Attributes:
         stage: the stage it belongs to.
         step: steps done in this stage, from 1.
-        loss: total loss of the step.
+        loss: total loss of the step; None where the stage has none to show.
         psnr: of the step's training images, dB; None where the stage renders none.
         splats: number of splats of all parts.
     """
 
     stage: str
     step: int
-    loss: float
+    loss: float | None
     psnr: float | None
     splats: int
 

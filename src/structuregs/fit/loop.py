@@ -16,7 +16,7 @@ from ..joints import kind_of
 from ..model import PosedParts
 from ..raster import image_loss, render
 from .densify import ScreenGradients, grow
-from .events import FitEvent, Note, StageStarted, Step
+from .events import FitEvent, Note, Step
 from .schedule import FitConfig
 from .structure import StructureWeights, contact_loss, structure_loss
 from .variables import SPLAT_NAMES, Variables
@@ -36,6 +36,7 @@ class FitState:
         moments: Adam's two moments of every leaf.
         gradients: screen-space gradients since the last round of densification.
         free_motions: the K motions (wxyz_xyz) as they were when they were still free.
+        size: of the object, about its radius, as the boxes had it before the first step; world units.
         step: steps done.
     """
 
@@ -43,6 +44,7 @@ class FitState:
     moments: dict[str, tuple[Tensor, Tensor]]
     gradients: ScreenGradients
     free_motions: Tensor
+    size: float
     step: int
 
     @staticmethod
@@ -50,7 +52,8 @@ class FitState:
         """The state before the first step."""
         variables = Variables.of(parts)
         gradients = ScreenGradients.zeros(sum(parts.counts), parts.tint.device)
-        return FitState(variables, _no_moments(variables), gradients, parts.motions.wxyz_xyz.clone(), 0)
+        size = float(parts.boxes.half_extents.norm(dim=-1).max())
+        return FitState(variables, _no_moments(variables), gradients, parts.motions.wxyz_xyz.clone(), size, 0)
 
     def save(self, file: Path) -> None:
         """Writes the checkpoint aside and renames it."""
@@ -64,6 +67,7 @@ class FitState:
             "moments": self.moments,
             "gradients": (self.gradients.total, self.gradients.seen),
             "free_motions": self.free_motions,
+            "size": self.size,
             "step": self.step,
         }
         staged = file.with_name(file.name + ".part")
@@ -82,7 +86,7 @@ class FitState:
             r = torch.load(content, map_location=device, weights_only=True)
             leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
             variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
-            return FitState(variables, r["moments"], ScreenGradients(*r["gradients"]), r["free_motions"], r["step"])
+            return FitState(variables, r["moments"], ScreenGradients(*r["gradients"]), r["free_motions"], r["size"], r["step"])
         except _DAMAGED as error:
             raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
 
@@ -102,12 +106,9 @@ class Fitter:
         self.device = device
         self.masks = [stack_views(views, config.structure_size) for views in capture.train]
         self.stacks: tuple[int, list[ImageStack]] = (0, [])
-        boxes = state.variables.boxes()
-        self.size = float(boxes.half_extents.detach().norm(dim=-1).max())  # of the object, about its radius
 
     def run(self, steps: int) -> Iterator[FitEvent]:
         """Takes steps until `steps` are done; yields a `Step` now and then."""
-        yield StageStarted("fit", self.config.steps)
         while self.state.step < min(steps, self.config.steps):
             if self.state.step == round(self.config.join_at * self.config.steps):
                 yield from self._join_parts()
@@ -127,7 +128,7 @@ class Fitter:
             if pair is None:
                 return
             step = self.state.step
-            self.state = replace(FitState.start(parts.joined(*pair)), step=step)
+            self.state = replace(FitState.start(parts.joined(*pair)), size=self.state.size, step=step)
             yield Note(f"two parts that move alike are one from step {step} on; {len(parts) - 2} left")
 
     def _settle_joints(self) -> Iterator[FitEvent]:
@@ -181,7 +182,13 @@ class Fitter:
         motions = parts.motions if self.config.motions_with_structure else SE3(parts.motions.wxyz_xyz.detach())
         loose = self.state.step < self.config.loose_until
         return structure_loss(
-            parts.boxes, motions, cameras, (masks[0], masks[1]), StructureWeights(), softness=0.01 * self.size, loose=loose
+            parts.boxes,
+            motions,
+            cameras,
+            (masks[0], masks[1]),
+            StructureWeights(),
+            softness=0.01 * self.state.size,
+            loose=loose,
         )
 
     def _image_loss(self, parts: PosedParts) -> tuple[Tensor, list, float | None]:
@@ -239,7 +246,7 @@ class Fitter:
         growing = growth.first * config.steps <= step < growth.last * config.steps
         noise = torch.Generator().manual_seed(int(np.random.default_rng((self.seed, step)).integers(2**62)))
         gradients = self.state.gradients if growing else None
-        self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.size, noise)
+        self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.state.size, noise)
         for name in SPLAT_NAMES:
             first, second = (moment[source] for moment in self.state.moments[name])
             first[fresh], second[fresh] = 0, 0

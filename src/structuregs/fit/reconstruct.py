@@ -1,14 +1,15 @@
 """From a capture to an articulated object: the whole way, in a run's folder that it can go on from."""
 
 import json
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
-from ..boxes import boxes_at_rest, boxes_of_parts, find_parts, seeded, strewn, survey
+from ..boxes import MovingPart, PartSearch, boxes_at_rest, boxes_of_parts, look_at_states, seeded, strewn
 from ..capture import Capture
 from ..geometry import SE3, Box
 from ..joints import articulate, joints_of
@@ -113,24 +114,38 @@ def start_parts(
 ) -> Iterator[FitEvent | PosedParts]:
     """Boxes, motions and the splats strewn in them; the last thing yielded is the `PosedParts`."""
     yield StageStarted("look", 2)
-    looks = survey(capture, points, config.start, seed)
-    yield Step("look", 2, 0.0, None, sum(len(look.splats) for look in looks))
+    looks = []
+    for look in look_at_states(capture, points, config.start, seed):
+        looks.append(look)
+        yield Step("look", len(looks), None, None, sum(len(look.splats) for look in looks))
+    pair = (looks[0], looks[1])
     generator = torch.Generator().manual_seed(seed)
     filling = (config.splats_per_part, config.sh_degree, generator)
     if config.hypotheses:
-        yield StageStarted("search", 1)
-        found = find_parts(looks, parts, config.start, seed)
-        boxes, motions = boxes_of_parts(looks, found, config.start)
-        posed = seeded(boxes, motions, looks, found, *filling)
-        yield Step("search", 1, 0.0, None, sum(posed.counts))
+        found = (yield from _searched(PartSearch(pair, config.start.search, seed)))[:parts]
+        boxes, motions = boxes_of_parts(pair, found, config.start)
+        posed = seeded(boxes, motions, pair, found, *filling)
     else:
-        boxes, motions = boxes_at_rest(looks, parts, config.start)
-        posed = strewn(boxes, motions, *filling, looks[0].splats.base_rgb.mean(0))
+        boxes, motions = boxes_at_rest(pair, parts, config.start)
+        posed = strewn(boxes, motions, *filling, pair[0].splats.base_rgb.mean(0))
     count = len(posed) - 1
     yield Note(f"{count} moving part{'' if count == 1 else 's'} found")
     if parts is not None and count != parts:
         yield Note(f"{parts} were asked for: what else moves does not show in masks and photos")
     yield posed
+
+
+def _searched(search: PartSearch) -> Generator[FitEvent, None, list[MovingPart]]:
+    """The moving parts that a search finds, its progress as events."""
+    clusters = len(search.clusters)
+    yield StageStarted("search", max(clusters, 1))
+    steps = search.steps()
+    while True:
+        try:
+            yield Step("search", next(steps), None, None, 0)
+        except StopIteration as done:
+            yield Step("search", max(clusters, 1), None, None, 0)
+            return done.value
 
 
 def tightened(parts: PosedParts) -> PosedParts:
@@ -222,6 +237,7 @@ def fit_run(
         state = FitState.start(begun.to(chosen))
         state.save(folder.checkpoint)
         clock.save()
+    yield StageStarted("fit", config.steps)
     fitter = Fitter(capture, config, state, seed, chosen)
     while fitter.state.step < config.steps:
         done = fitter.state.step
@@ -274,8 +290,6 @@ def reconstruct(
         points: where first points come from: "hull", "depth" or a file.
         seed: of all randomness.
     """
-    import tempfile
-
     config = config or PRESETS["default"]
     with tempfile.TemporaryDirectory() as scratch:
         folder = run if run is not None else Path(scratch)

@@ -18,7 +18,7 @@ class Rates:
     logit_opacities: float = 5e-2
     """Of splat opacities."""
     sh: float = 1e-2
-    """Of the constant colour; higher bands get a twentieth."""
+    """Of the colours' spherical harmonics."""
     tint: float = 5e-3
     """Of the colour difference between the states, rgb."""
     boxes: float = 3e-3
@@ -101,6 +101,12 @@ class FitConfig:
     """Learning rates."""
     growth: Growth = field(default_factory=Growth)
     """Densification and pruning."""
+
+    def __post_init__(self) -> None:
+        if self.structure_until < self.image_from:
+            raise ValueError(
+                f"structure_until {self.structure_until} lies before image_from {self.image_from}: no loss is on in between."
+            )
 
 
 PRESETS: dict[str, FitConfig] = {
