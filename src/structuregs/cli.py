@@ -117,13 +117,15 @@ def demo(run: NewRun = Path("runs/demo")) -> None:
 
 def _make_known(capture: Path) -> Path:
     """Makes the demo's capture where it is not there yet, aside and then into place; the folder of its truth."""
-    from .synthetic import RenderOptions, make_capture, make_object, save_known
+    from .synthetic import Lighting, RenderOptions, make_capture, make_object, save_known
 
     if not capture.exists():
         print(f"making a capture of a cabinet with a door and a drawer in {capture}")
         cabinet = make_object("cabinet")
         staged = capture.with_name("capture.part")
-        save_known(cabinet, make_capture(cabinet, RenderOptions(size=256, views=40)), staged, "artgs")
+        save_known(
+            cabinet, make_capture(cabinet, RenderOptions(size=256, views=40, lighting=Lighting(ambient=0.75))), staged, "artgs"
+        )
         staged.replace(capture)
     return capture / "gt"
 

@@ -1,13 +1,17 @@
 """Boxes to posed parts: the splats that a fit starts from."""
 
+from dataclasses import replace
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..geometry import SE3, Box, quat_multiply
 from ..model import SH_C0, PosedParts, Splats
 from .cue import StateLook
 from .partition import MovingPart
+
+FAINT = -2.2  # logit of the opacity of splats that are only on trial, about 0.1
 
 
 def strewn(
@@ -25,7 +29,7 @@ def strewn(
         means,
         torch.tensor([1.0, 0, 0, 0]).repeat(K * per_part, 1),
         log_scales.contiguous().float(),
-        torch.full((K * per_part,), -2.2),
+        torch.full((K * per_part,), FAINT),
         sh,
     )
     return PosedParts(boxes, motions, splats, (per_part,) * K, torch.zeros(K * per_part, 3))
@@ -67,11 +71,33 @@ def seeded(
             free[state] &= ~posed[state][k].contains(looks[state].splats.means)
         pieces.append(_in_box(look[inside], box, sh_degree))
     pieces = [pieces[-1], *pieces[:-1]]
-    rgb = looks[0].splats.base_rgb.mean(0)
-    faint = strewn(boxes, motions, per_part, sh_degree, generator, rgb)
-    rows = [splats for k, piece in enumerate(pieces) for splats in (piece, faint.part_splats(k))]
-    counts = tuple(len(piece) + per_part for piece in pieces)
+    pieces[0] = _doubted(pieces[0], boxes, motions)
+    faint = strewn(boxes, motions, per_part, sh_degree, generator, looks[0].splats.base_rgb.mean(0))
+    extra = [faint.part_splats(k) for k in range(len(sources))]
+    extra[0] = extra[0][~_in_moving_box(boxes[0].to_world(extra[0].means), boxes, motions)]
+    counts = tuple(len(piece) + len(more) for piece, more in zip(pieces, extra, strict=True))
+    rows = [splats for pair in zip(pieces, extra, strict=True) for splats in pair]
     return PosedParts(boxes, motions, Splats.concatenate(rows), counts, torch.zeros(sum(counts), 3))
+
+
+def _in_moving_box(points: Float[Tensor, "N 3"], boxes: Box, motions: SE3) -> Bool[Tensor, " N"]:
+    """Whether world points lie in a moving box, in either state."""
+    inside = torch.zeros(len(points), dtype=torch.bool)
+    for posed in (boxes, boxes.moved(motions)):
+        for k in range(1, len(boxes.half_extents)):
+            inside |= posed[k].contains(points)
+    return inside
+
+
+def _doubted(base: Splats, boxes: Box, motions: SE3) -> Splats:
+    """The base's splats, those faint that lie where a moving part is in the other state: they have yet to prove themselves.
+
+    A look at one state cannot tell what hangs in a place that hardly any view sees into, such as the opening of a cabinet;
+    what it leaves there would hide the part that belongs there in the other state.
+    """
+    doubtful = _in_moving_box(boxes[0].to_world(base.means), boxes, motions)
+    faint = torch.where(doubtful, base.logit_opacities.clamp(max=FAINT), base.logit_opacities)
+    return replace(base, logit_opacities=faint)
 
 
 def _in_box(splats: Splats, box: Box, sh_degree: int) -> Splats:

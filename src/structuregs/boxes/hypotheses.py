@@ -16,7 +16,7 @@ from torch import Tensor
 from ..geometry import SE3, Box, Screw, screw_at
 from ..points import Hull
 
-_ANGLES = torch.deg2rad(torch.tensor([8.0, *range(15, 181, 15)], dtype=torch.float64))
+_ANGLES = torch.deg2rad(torch.arange(7.5, 181, 7.5, dtype=torch.float64))
 _LENGTHS = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.75, 2.0], dtype=torch.float64)
 
 
@@ -45,7 +45,7 @@ class Hypothesis:
         what is odd about a motion, and what the masks say, count as shares of `gain`, the most that any hypothesis takes off
         the error.
         """
-        against = 0.2 * self.oddity + 0.2 * min(self.outside, 1.0) + 0.3 * self.unexplained
+        against = 0.2 * self.oddity + 0.2 * min(self.outside, 1.0) + 0.1 * self.unexplained
         return self.image_error + gain * against
 
 
@@ -58,7 +58,7 @@ def hinge_screws(box: Box) -> list[Screw]:
     R, centre, h = box.T_world_box.rotation, box.T_world_box.xyz, box.half_extents
     for axis in range(3):
         b, c = (axis + 1) % 3, (axis + 2) % 3
-        for i, j in itertools.product((-1.3, -1, 0, 1, 1.3), repeat=2):
+        for i, j in itertools.product((-1.6, -1.3, -1, 0, 1, 1.3, 1.6), repeat=2):
             if abs(i) > 1 and abs(j) > 1:
                 continue
             screws.append(Screw("revolute", R[:, axis], centre + R[:, b] * h[b] * i + R[:, c] * h[c] * j))

@@ -30,18 +30,23 @@ class Scene:
     rest: Splats
     views: Int64[np.ndarray, " L"]
 
-    def loss(self, part: Splats | None, v: int) -> Float[Tensor, ""]:
-        """Error of one photo with the part where it is, or without it."""
+    def loss(self, part: Splats, v: int) -> Float[Tensor, ""]:
+        """Error of one photo with the part where it is."""
         stack = self.look.stack
         rgb, alpha = stack.target(v)
-        picture = render(self.rest if part is None else Splats.concatenate([self.rest, part]), stack.cameras[v])
+        picture = render(Splats.concatenate([self.rest, part]), stack.cameras[v])
         return image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=0.5)
 
     @torch.no_grad()
-    def error(self, part: Splats | None, motion: SE3, quick: bool = False) -> float:
+    def error(self, part: Splats, motion: SE3, quick: bool = False) -> float:
         """Mean error of the judging photos with the part moved."""
-        moved = None if part is None else part.moved(motion)
+        moved = part.moved(motion)
         return float(np.mean([float(self.loss(moved, int(v))) for v in self.views[:: 4 if quick else 1]]))
+
+    @torch.no_grad()
+    def absent(self, part: Splats) -> float:
+        """Mean error of the judging photos without the part."""
+        return float(np.mean([float(self.loss(part[:0], int(v))) for v in self.views]))
 
     def judge(self, hypothesis: Hypothesis, part: Splats, quick: bool = False) -> Hypothesis:
         """The hypothesis with its image error."""
@@ -83,8 +88,8 @@ def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, base:
     """The hypothesis, or the simplest motion near it that the photos like about as well.
 
     A few photos of a small part hardly tell a slide from a slide with a little turn, or one along the box from one a little
-    askew; joints are built along boxes, and they turn or slide.  Tried in turn: the slide along an axis of the box or the
-    base, the slide, the turn.
+    askew; joints are built along boxes, and they turn or slide.  Tried in turn: the slide and the turn along an axis of
+    the box or the base, the slide, the turn.
 
     Args:
         hypothesis: a motion with its image error.
@@ -96,14 +101,15 @@ def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, base:
     """
     motion, centre = hypothesis.motion, box.T_world_box.xyz
     slide, length = screw_at(motion, "prismatic", centre)
-    axes = torch.cat([box.T_world_box.rotation.T, base.T_world_box.rotation.T])
-    along = axes @ slide.axis
-    nearest = int(along.abs().argmax())
     turn, angle = screw_at(motion, "revolute", centre)
+    axes = torch.cat([box.T_world_box.rotation.T, base.T_world_box.rotation.T])
     candidates = [slide.motion(length), turn.motion(angle)]
-    if abs(float(along[nearest])) > np.cos(np.deg2rad(15)):
-        candidates.insert(0, replace(slide, axis=axes[nearest]).motion(length * float(along[nearest])))
-    enough = hypothesis.image_error + 0.2 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent
+    for screw, q in ((turn, angle), (slide, length)):
+        along = axes @ screw.axis
+        nearest = int(along.abs().argmax())
+        if abs(float(along[nearest])) > np.cos(np.deg2rad(15)):
+            candidates.insert(0, replace(screw, axis=axes[nearest]).motion(q * float(along[nearest])))
+    enough = hypothesis.image_error + 0.05 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent
     for simple in candidates:
         judged = scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
         if judged.image_error < enough:

@@ -22,17 +22,17 @@ class SearchConfig:
     """The motion cue."""
     most: int = 12
     """Clusters that are looked at, the largest first."""
-    shortlist: int = 60
+    shortlist: int = 110
     """Hypotheses per cluster that pass the hull and are shown to the photos."""
-    finalists: int = 5
-    """Distinct hypotheses per cluster that the photos pull into place."""
+    finalists: int = 3
+    """Distinct hypotheses per cluster that the photos pull into place: so many of the photos' choice and of the masks'."""
     looks: int = 16
     """Photos of the other state that judge the shortlist."""
     steps: int = 40
     """Optimiser steps for each finalist."""
     rate: float = 0.03
     """Of a finalist's pose: radians, and parts of the box's half diagonal."""
-    same: float = 0.25
+    same: float = 0.3
     """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
     alike: float = 0.75
     """...and if moving it like the other takes this fraction of the best gain off the photo error."""
@@ -129,7 +129,7 @@ class PartSearch:
             parts.append(part)
             explained |= members | self._explained_by(part)
         if len(parts) > 1:
-            parts = self._settled(self._reconsider(parts))
+            parts = self._settled(self._without_pieces(self._reconsider(parts)))
         return sorted(parts, key=lambda part: -part.gain)
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
@@ -150,6 +150,7 @@ class PartSearch:
             by_cost = sorted(again, key=lambda h: h.cost(most))
             gaps = displacements(SE3(torch.stack([T.wxyz_xyz for T in shared])), by_cost[0].motion, box)
             likeness = np.where(gaps < self.config.same, np.array(gains[-len(shared) :]) / most, 0.0)
+
             twin = int(np.argmax(likeness))
             if likeness[twin] > self.config.alike:
                 parts = self._merged(others[twin], part, [p for p in others if p is not others[twin]])
@@ -161,6 +162,18 @@ class PartSearch:
             index += 1
         return parts
 
+    def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
+        """The parts, without those that lie within a larger one: what was left over before that one was whole."""
+        kept: list[MovingPart] = []
+        for part in sorted(parts, key=lambda part: -len(part.points)):
+            points = torch.from_numpy(part.points)
+            within = [
+                self._box(whole.points_in(part.state)).contains(points, margin=3 * self.voxel).double().mean() for whole in kept
+            ]
+            if not within or max(within) < 0.6:
+                kept.append(part)
+        return kept
+
     def _again(self, part: MovingPart, others: list[MovingPart]) -> tuple[Box, Splats, Scene, float]:
         """A part's box and splats, the photos of the other state with all other parts in place, and their error without it."""
         box = self._box(part.points)
@@ -168,15 +181,18 @@ class PartSearch:
         scene = Scene(self.looks[other], self._rest(others, part.state), self._judges(other))
         splats = self.looks[part.state].splats
         piece = splats[self._inside(splats, [box])]
-        return box, piece, scene, scene.error(None, SE3.identity(dtype=torch.float64))
+        return box, piece, scene, scene.absent(piece)
 
     def _settled(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts after one longer refinement of each, with the motions of the others as they now are."""
         parts = list(parts)
         for index, part in enumerate(parts):
             box, piece, scene, absent = self._again(part, parts[:index] + parts[index + 1 :])
-            h = refine(part.hypothesis, scene, piece, box, 2 * self.config.steps, self.config.rate)
-            parts[index] = replace(part, hypothesis=simplest(h, scene, piece, box, self.base_box, absent))
+            starts = [part.hypothesis, *part.rivals[:1]]
+            again = [refine(h, scene, piece, box, 2 * self.config.steps, self.config.rate) for h in starts]
+            gain = max(absent - min(h.image_error for h in again), 0.0)
+            best = min(again, key=lambda h: h.cost(gain))
+            parts[index] = replace(part, hypothesis=simplest(best, scene, piece, box, self.base_box, absent))
         return parts
 
     def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
@@ -214,28 +230,26 @@ class PartSearch:
         landing = np.concatenate([self.clusters[i].points for i in arrivals]) if arrivals else np.zeros((0, 3))
         landing = self._sample(landing, 300)
         outside, unexplained = hull_scores(motions, self._sample(cluster.points, 300), target.hull, landing, box)
-        odd = np.array([oddity(motions[m], box) for m in range(len(outside))])
-        ranked = np.argsort(outside + unexplained + 0.25 * odd, kind="stable")
+        travel = displacements(motions, SE3.identity(dtype=torch.float64), box)
+        ranked = np.argsort(outside + unexplained + 0.05 * travel, kind="stable")
         ranked = ranked[outside[ranked] < outside.min() + 0.5]
-        ranked = ranked[distinct(motions[ranked], box, 0.08, self.config.shortlist)]
+        ranked = ranked[distinct(motions[ranked], box, 0.12, self.config.shortlist)]
         fits = np.zeros((len(self.clusters), len(outside)), bool)
         for i in siblings:
             sample = self._sample(self.clusters[i].points, 100)
-            fits[i] = hull_scores(motions, sample, target.hull, np.zeros((0, 3)), self.boxes[i])[0] < 0.3
+            fits[i] = hull_scores(motions, sample, target.hull, np.zeros((0, 3)), self.boxes[i])[0] < 0.8
 
         scene = Scene(target, self._rest(parts, state), self._judges(other))
-        absent = scene.error(None, SE3.identity(dtype=torch.float64))
+        absent = scene.absent(target.splats)
         judged: list[tuple[Hypothesis, frozenset[int]]] = []
         for m in ranked:
             together = frozenset(i for i in siblings if fits[i, m])
             for group in {frozenset(), together}:
-                start = Hypothesis(motions[int(m)], float(outside[m]), float(unexplained[m]), float(odd[m]))
+                motion = motions[int(m)]
+                start = Hypothesis(motion, float(outside[m]), float(unexplained[m]), oddity(motion, box))
                 judged.append((scene.judge(start, self._piece({index, *group}), quick=True), group))
-        gain = max(absent - min(h.image_error for h, _ in judged), 0.0)
-        judged.sort(key=lambda row: row[0].cost(gain))
-        chosen = distinct(stack_motions([start for start, _ in judged]), box, 0.15, self.config.finalists)
         refined = []
-        for start, group in (judged[c] for c in chosen):
+        for start, group in self._finalists(judged, box, absent):
             piece = self._piece({index, *group})
             refined.append((refine(start, scene, piece, box, self.config.steps, self.config.rate), group))
         gain = max(absent - min(h.image_error for h, _ in refined), 0.0)
@@ -248,6 +262,24 @@ class PartSearch:
         points = np.concatenate([self.clusters[i].points for i in sorted(members)])
         gain = (absent - best.image_error) / absent
         return MovingPart(state, points, best, gain, tuple(rival for rival, _ in refined[1:])), members
+
+    def _finalists(
+        self, judged: list[tuple[Hypothesis, frozenset[int]]], box: Box, absent: float
+    ) -> list[tuple[Hypothesis, frozenset[int]]]:
+        """The best by the photos and, where these see little of a part or in another light, the best by the masks.
+
+        Args:
+            judged: hypotheses in the masks' order, each with the clusters that move along.
+            box: of the cluster.
+            absent: error of the photos without the part.
+        """
+        gain = max(absent - min(h.image_error for h, _ in judged), 0.0)
+        by_photos = sorted(judged, key=lambda row: row[0].cost(gain))
+        rows = []
+        for order in (by_photos, judged):
+            chosen = distinct(stack_motions([start for start, _ in order]), box, 0.15, self.config.finalists)
+            rows += [order[c] for c in chosen]
+        return [rows[c] for c in distinct(stack_motions([start for start, _ in rows]), box, 0.02, len(rows))]
 
     def _piece(self, members: set[int]) -> Splats:
         """The splats of the clusters in `members`, all of one state."""
