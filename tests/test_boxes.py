@@ -37,7 +37,7 @@ from structuregs.capture import Capture, TrueJoint
 from structuregs.geometry import SE3, Box, Screw
 from structuregs.joints import kind_of
 from structuregs.model import Splats
-from structuregs.synthetic import KnownObject, RenderOptions, make_capture, make_object
+from structuregs.synthetic import KnownObject, Lighting, RenderOptions, make_capture, make_object
 
 F64 = torch.float64
 SMALL = StartConfig(
@@ -136,14 +136,16 @@ class TestCandidates:
         without, with_target = (candidate_motions(box, box, targets) for targets in ([], [box.moved(true)]))
         assert len(with_target.wxyz_xyz) == len(without.wxyz_xyz) + 24
 
-    def test_hinges_are_the_edges_and_the_lines_between_them(self):
+    def test_hinges_are_the_edges_the_lines_between_and_some_beyond(self):
         box = random_box(1)
         for screw in hinge_screws(box):
             along = box.T_world_box.rotation.T @ screw.axis
             at = (box.T_world_box.inverse().apply(screw.origin) / box.half_extents).abs()
             assert along.abs().max() == pytest.approx(1.0)
-            assert ((at < 1e-9) | ((at - 1).abs() < 1e-9)).all()
-        assert len(hinge_screws(box)) == 27
+            assert torch.isin((at * 10).round(), torch.tensor([0.0, 10, 13, 16], dtype=at.dtype)).all()
+            assert ((at * 10) - (at * 10).round()).abs().max() < 1e-6
+            assert (at > 1.1).sum() <= 1, "beyond the box to one side only"
+        assert len(hinge_screws(box)) == 3 * (3 * 3 + 2 * 4 * 3)
 
 
 def slides_by(offsets: list[list[float]]) -> SE3:
@@ -262,7 +264,7 @@ class TestSurvey:
         for look in looks:
             scene = Scene(look, look.splats, np.arange(3))
             nothing = Scene(look, look.splats[:1], np.arange(3))
-            assert scene.error(None, NO_MOTION) < 0.2 * nothing.error(None, NO_MOTION)
+            assert scene.absent(look.splats) < 0.2 * nothing.absent(look.splats)
 
     def test_given_points_take_the_place_of_its_own(self):
         obj, looks = looks_of("laptop")
@@ -329,18 +331,20 @@ class TestParts:
         assert gap < 0.05
         assert part.gain > 0.02
 
-    @pytest.mark.xfail(strict=True, reason="the search loses one of the two parts on photos this small")
     def test_a_door_and_a_drawer_both_shut_are_found(self):
-        obj, looks = looks_of("cabinet")
-        parts = parts_of("cabinet")
+        obj = make_object("cabinet")
+        # In even light: where a door looks quite another colour once it is open, so few photos do not tell its angle.
+        options = RenderOptions(size=200, views=32, test_views=1, samples=2, lighting=Lighting(ambient=0.75))
+        config = StartConfig(appearance=AppearanceConfig(steps=300))
+        looks = survey(make_capture(obj, options), "hull", config, seed=0)
+        parts = find_parts(looks, None, config, seed=0)
         assert len(parts) == 2
         for true in obj.joints:
             (part,) = [p for p in parts if kind_of(p.motion) == true.kind]
             degrees, gap = errors(part.motion, part.points_in(0), true)
             assert degrees < 6
             assert gap < 0.08
-        (best,) = find_parts(looks, 1, SMALL, seed=0)
-        assert best.gain == max(part.gain for part in parts)
+        assert parts[0].gain == max(part.gain for part in parts)
 
     def test_nothing_moves_in_a_still_object(self):
         assert parts_of("static") == []
