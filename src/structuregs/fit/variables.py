@@ -94,9 +94,3 @@ class Variables:
 def part_index(counts: tuple[int, ...], device: torch.device) -> Int[Tensor, " N"]:
     """The part of each splat, for splats in the order of their parts."""
     return torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)).to(device)
-
-
-def detached(variables: Variables) -> PosedParts:
-    """The posed parts without history."""
-    with torch.no_grad():
-        return variables.parts().detach()

@@ -56,14 +56,6 @@ def _matrix_to_quat(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]
     return torch.where(q[..., :1] < 0, -q, q)
 
 
-def _cross_matrix(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The matrices [v]x with [v]x u = v x u."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
-    return torch.stack(rows, -2)
-
-
 @dataclass(frozen=True)
 class SE3:
     """Rigid motions `T_a_b`: coordinates in b to coordinates in a, `p_a = T_a_b @ p_b`.
