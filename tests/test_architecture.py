@@ -15,6 +15,7 @@ PACKAGE = Path(structuregs.__file__).parent
 # A room imports only rooms of lower levels; the two doors may import all of them.
 LEVELS = {
     "geometry": 0,
+    "jit": 0,
     "model": 1,
     "capture": 1,
     "metrics": 1,

@@ -1,5 +1,6 @@
 """structuregs: photos of an articulated object in two states go in; a working digital twin comes out."""
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,10 @@ __all__ = [
     "save_object",
     "write_sweep",
 ]
+
+# Threads that wait for others sleep instead of spinning: on cores that are shared with other work, spinning makes every
+# kernel wait for a thread that is not running.  OpenMP reads this once, when it is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 # The rooms need torch, which takes a second to import: each name is fetched from its room when it is first used.
 _ROOMS = {

@@ -1,18 +1,16 @@
 """Visual hulls: what the masks of all views leave standing."""
 
-import inspect
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64
-from numba import njit, prange
+from numba import prange
 from scipy import ndimage
 
 from ..capture import CaptureError
 from ..geometry import Camera
+from ..jit import kernel, lanes
 
 
 @dataclass(frozen=True)
@@ -50,12 +48,7 @@ class Hull:
         return values
 
 
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function compiled with Numba and cached on disk, without the shape checker that the tests wrap around it."""
-    return njit(inspect.unwrap(function), parallel=True, cache=True)
-
-
-@_compiled
+@kernel(parallel=True)
 def _carve(origin, voxel, shape, projections, inside):
     """Occupancy: voxels that a third of the views see, and whose centre falls on the mask in every view that sees it."""
     X, Y, Z = shape
@@ -115,7 +108,9 @@ class Silhouettes:
             radius = 0.5 * voxel * camera.fx / max(float(projections[v, 2] @ centre), 1e-6)
             if radius >= 0.5:
                 inside[v] = np.asarray(ndimage.distance_transform_edt(~inside[v])) <= radius
-        return Hull(low, voxel, _carve(low, voxel, shape, projections, inside))
+        with lanes():
+            occupied = _carve(low, voxel, shape, projections, inside)
+        return Hull(low, voxel, occupied)
 
 
 def _reach(silhouettes: tuple[Silhouettes, ...]) -> tuple[Float64[np.ndarray, " 3"], float]:

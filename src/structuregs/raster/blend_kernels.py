@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import prange
 
-from .jit import fast_exp2, kernel
+from ..jit import fast_exp2, kernel
 from .records import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 TILE = 16
@@ -204,7 +204,7 @@ def blend_forward(starts, splats, drawing, background, lanes, image, alpha, dept
             _blend_tile(tile, starts, splats, drawing, background, across, image, alpha, depth, ends)
 
 
-@kernel()
+@kernel(inline=False)
 def _blend_tile(tile, starts, splats, drawing, background, across, image, alpha, depth, ends):
     height, width = alpha.shape
     x0, y0 = (tile % across) * TILE, (tile // across) * TILE
@@ -267,7 +267,7 @@ def blend_backward(starts, splats, drawing, ends, lanes, image, alpha, depth, g_
             _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, depth, g_image, g_alpha, g_depth, partials)
 
 
-@kernel()
+@kernel(inline=False)
 def _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, depth, g_image, g_alpha, g_depth, partials):
     height, width = alpha.shape
     x0, y0 = (tile % across) * TILE, (tile // across) * TILE

@@ -5,15 +5,14 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import get_num_threads
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..geometry import Camera
+from ..jit import lanes
 from ..model import Splats
 from . import blend_kernels as bk
 from . import project_kernels as pk
-from .jit import PARALLEL
 from .records import Projection, Render, frustum_limits, splat_rgb
 
 
@@ -61,7 +60,7 @@ class _Project(torch.autograd.Function):
         arrays = [_array(t) for t in (means, quats, log_scales, logit_opacities)]
         n = len(means)
         outputs = [np.empty(shape, np.float32) for shape in ((n, 2), (n, 3), n, (n, 2), n)]
-        with PARALLEL:
+        with lanes():
             pk.project_forward(*arrays, *view, *outputs)
         xy, conic, depth, extent, opacity = _tensors(outputs)
         ctx.save_for_backward(means, quats, log_scales, opacity, extent)
@@ -78,7 +77,7 @@ class _Project(torch.autograd.Function):
         n = len(opacity)
         incoming = _or_zeros(g_xy, n, 2), _or_zeros(g_conic, n, 3), _or_zeros(g_depth, n), _or_zeros(g_opacity, n)
         outgoing = [np.empty(shape, np.float32) for shape in ((n, 3), (n, 4), (n, 3), n)]
-        with PARALLEL:
+        with lanes():
             pk.project_backward(*map(_array, inputs), *ctx.view, _array(opacity), _array(extent), *incoming, *outgoing)
         dtypes = [*(t.dtype for t in inputs), ctx.logit_dtype]
         return *(t.to(dtype) for t, dtype in zip(_tensors(outgoing), dtypes, strict=True)), None
@@ -94,11 +93,10 @@ class _Blend(torch.autograd.Function):
         drawing, reach = bk.pack(_array(xy), _array(conic), _array(opacity), _array(rgb), z, reached)
         order = bk.depth_order(z, reached)
         drawn = [np.empty(shape, np.float32) for shape in ((*size, 3), size, size)]
-        with PARALLEL:
-            lanes = get_num_threads()
-            starts, splats = bk.tile_lists(reach, order, width, height, lanes)
+        with lanes() as threads:
+            starts, splats = bk.tile_lists(reach, order, width, height, threads)
             ends = np.empty(len(starts) - 1, np.int64)
-            bk.blend_forward(starts, splats, drawing, _array(background), lanes, *drawn, ends)
+            bk.blend_forward(starts, splats, drawing, _array(background), threads, *drawn, ends)
         outputs = _tensors(drawn)
         ctx.save_for_backward(conic, opacity, *outputs)
         ctx.lists, ctx.drawing = (starts, ends, splats), drawing
@@ -114,9 +112,8 @@ class _Blend(torch.autograd.Function):
         g_image, g_alpha = _or_zeros(gradients[0], *size, 3), _or_zeros(gradients[1], *size)
         g_depth = None if gradients[2] is None else _array(gradients[2])
         partials = np.empty((len(splats), bk.PARTIALS), np.float32)
-        with PARALLEL:
-            lanes = get_num_threads()
-            bk.blend_backward(starts, splats, ctx.drawing, ends, lanes, *drawn, g_image, g_alpha, g_depth, partials)
+        with lanes() as threads:
+            bk.blend_backward(starts, splats, ctx.drawing, ends, threads, *drawn, g_image, g_alpha, g_depth, partials)
         g_xy, g_conic, g_opacity, g_rgb, g_z = _tensors(bk.sum_partials(starts, ends, splats, partials, conic, opacity))
         g_background = None
         if ctx.needs_input_grad[6]:

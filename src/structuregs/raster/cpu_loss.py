@@ -2,12 +2,11 @@
 
 import numpy as np
 import torch
-from numba import get_num_threads
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..jit import lanes
 from . import loss_kernels as lk
-from .jit import PARALLEL
 
 
 class ImageLoss(torch.autograd.Function):
@@ -22,10 +21,8 @@ class ImageLoss(torch.autograd.Function):
         weights = np.array([1 - ssim_weight, ssim_weight, alpha_weight]) / [rgb.numel(), rgb.numel(), alpha.numel()]
         g_image, g_alpha = np.empty_like(image), np.empty_like(arrays[2])
         parts = np.empty((-(-height // lk.ROWS) * -(-width // lk.COLUMNS), 3))
-        with PARALLEL:
-            lk.loss_and_gradient(
-                image, target, *arrays[2:], weights.astype(np.float32), get_num_threads(), g_image, g_alpha, parts
-            )
+        with lanes() as threads:
+            lk.loss_and_gradient(image, target, *arrays[2:], weights.astype(np.float32), threads, g_image, g_alpha, parts)
         ctx.save_for_backward(torch.from_numpy(g_image).view(height, width, 3), torch.from_numpy(g_alpha))
         return torch.tensor(float(parts.sum(0) @ weights), dtype=rgb.dtype)
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import prange
 
-from .jit import kernel
+from ..jit import kernel
 
 ROWS, COLUMNS = 48, 96  # of a rectangle, pixels
 HALF = 5  # of the 11 x 11 window, pixels

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import prange
 
-from .jit import kernel
+from ..jit import kernel
 from .records import DILATION, MIN_ALPHA, NEAR
 
 _NEAR, _DILATION, _MIN_ALPHA = np.float32(NEAR), np.float32(DILATION), np.float32(MIN_ALPHA)
