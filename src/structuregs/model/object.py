@@ -59,7 +59,7 @@ def save_object(obj: ArticulatedObject, folder: Path) -> None:
         "version": VERSION,
         "parts": [
             {
-                "name": "base" if k == 0 else f"part_{k}",
+                "name": parts.names[k],
                 "splats": parts.counts[k],
                 "box": {
                     "wxyz_xyz": parts.boxes.T_world_box.wxyz_xyz[k].tolist(),

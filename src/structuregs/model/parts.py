@@ -36,6 +36,11 @@ class PosedParts:
         return len(self.counts)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The parts' names in files: `base`, `part_1`, `part_2` and so on."""
+        return ("base", *(f"part_{k}" for k in range(1, len(self))))
+
+    @property
     def part(self) -> Int[Tensor, " N"]:
         """The part of each splat."""
         return torch.repeat_interleave(torch.arange(len(self)), torch.tensor(self.counts))
