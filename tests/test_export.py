@@ -1,4 +1,5 @@
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -49,6 +50,30 @@ def test_animations_hold_all_frames_and_play_for_ever(obj, tmp_path, ending):
     assert [p.name for p in tmp_path.iterdir()] == [file.name]
 
 
+def test_a_film_shows_the_sweep_in_its_colours_and_comes_out_the_same_twice(obj, tmp_path):
+    av = pytest.importorskip("av")
+    camera = Camera(looking("+y").T_world_camera, 120.0, 120.0, 47.5, 40.5, 95, 81)
+    files = [write_sweep(obj, camera, tmp_path / name, frames=6, seconds=0.5)[0] for name in ("a.mp4", "b.mp4")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mp4", "b.mp4"]
+    with av.open(files[0]) as film:
+        stream = film.streams.video[0]
+        assert (stream.average_rate, stream.duration * stream.time_base) == (12, 0.5)
+        shown = [frame.to_ndarray(format="rgb24").astype(float) for frame in film.decode(video=0)]
+    meant = [np.pad(frame, ((0, 1), (0, 1), (0, 0)), mode="edge") for frame in render_sweep(obj, camera, frames=6)]
+    assert [frame.shape for frame in shown] == [(82, 96, 3)] * 6
+    for frame, other in zip(shown, meant, strict=True):
+        assert np.abs(frame.mean((0, 1)) - other.mean((0, 1))).max() < 2
+        assert np.sqrt(((frame - other) ** 2).mean()) < 12
+
+
+def test_a_film_without_its_extra_is_a_sentence_and_leaves_nothing(obj, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(ValueError, match=r"sweep\.mp4: an \.mp4 needs the package av; install it with `pip install"):
+        write_sweep(obj, looking("+y"), tmp_path / "sweep.mp4")
+    assert not list(tmp_path.iterdir())
+
+
 def test_stills_are_one_picture_or_a_folder(obj, tmp_path):
     write_sweep(obj, looking("+y"), tmp_path / "three.png")
     with Image.open(tmp_path / "three.png") as image:
@@ -59,8 +84,8 @@ def test_stills_are_one_picture_or_a_folder(obj, tmp_path):
 
 
 def test_another_ending_is_a_sentence(obj, tmp_path):
-    with pytest.raises(ValueError, match=r"sweep\.mp4: a sweep is written as \.webp, \.gif, \.png or a folder"):
-        write_sweep(obj, looking("+y"), tmp_path / "sweep.mp4")
+    with pytest.raises(ValueError, match=r"sweep\.avi: a sweep is written as \.mp4, \.webp, \.gif, \.png or a folder"):
+        write_sweep(obj, looking("+y"), tmp_path / "sweep.avi")
 
 
 def test_the_telling_camera_sees_the_motion_and_not_along_it():

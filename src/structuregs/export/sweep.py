@@ -1,7 +1,8 @@
 """An object's joints swept there and back: animations and stills."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -42,17 +43,18 @@ def write_sweep(obj: ArticulatedObject, camera: Camera, path: Path, *, frames: i
     Args:
         obj: what moves.
         camera: from where, and in which size.
-        path: `.webp` or `.gif`: an animation; `.png`: state 0, half way and state 1 side by side; without an ending: a
-            folder of one numbered PNG for each frame.
+        path: `.mp4` (needs the extra `video`), `.webp` or `.gif`: an animation; `.png`: state 0, half way and state 1
+            side by side; without an ending: a folder of one numbered PNG for each frame.
         frames: of the whole way there and back.
         seconds: how long an animation takes.
 
     Raises:
-        ValueError: the path has another ending.
+        ValueError: the path has another ending, or is an `.mp4` and the extra is missing.
     """
     ending = path.suffix.lower()
-    if ending not in (*_FORMATS, ".png", ""):
-        raise ValueError(f"{path}: a sweep is written as .webp, .gif, .png or a folder; give a path with one of these endings.")
+    if ending not in (*_FORMATS, ".mp4", ".png", ""):
+        endings = ".mp4, .webp, .gif, .png or a folder"
+        raise ValueError(f"{path}: a sweep is written as {endings}; give a path with one of these endings.")
     if ending == "":
         path.mkdir(parents=True, exist_ok=True)
         return [
@@ -63,6 +65,8 @@ def write_sweep(obj: ArticulatedObject, camera: Camera, path: Path, *, frames: i
     if ending == ".png":
         stops = [[joint.q[1] * i / (_STILLS - 1) for joint in obj.joints] for i in range(_STILLS)]
         return [_save(Image.fromarray(np.hstack([_picture(obj.at(q), camera) for q in stops])), path, "PNG")]
+    if ending == ".mp4":
+        return [_save_film(render_sweep(obj, camera, frames=frames), camera, path, frames / seconds)]
     first, *rest = (Image.fromarray(rgb) for rgb in render_sweep(obj, camera, frames=frames))
     options = {"save_all": True, "append_images": rest, "duration": round(1000 * seconds / frames), "loop": 0}
     return [_save(first, path, _FORMATS[ending], **options)]
@@ -89,5 +93,32 @@ def _picture(splats: Splats, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
 def _save(image: Image.Image, path: Path, kind: str, **options: object) -> Path:
     staged = path.with_name(path.name + ".part")
     image.save(staged, format=kind, **options)
+    staged.replace(path)
+    return path
+
+
+def _save_film(pictures: Iterable[UInt8[np.ndarray, "H W 3"]], camera: Camera, path: Path, rate: float) -> Path:
+    """An H.264 film of `rate` pictures a second; an odd width or height grows by one pixel, as the format asks."""
+    try:
+        import av
+        from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
+    except ImportError as error:
+        raise ValueError(
+            f"{path}: an .mp4 needs the package av; install it with `pip install 'structuregs[video]'`."
+        ) from error
+    staged = path.with_name(path.name + ".part")
+    grown = ((0, camera.height % 2), (0, camera.width % 2), (0, 0))
+    with av.open(staged, "w", format="mp4") as film:
+        stream = film.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000), options={"crf": "18"})
+        stream.pix_fmt = "yuv420p"
+        stream.width, stream.height = camera.width + camera.width % 2, camera.height + camera.height % 2
+        # Players guess wrong where a film does not say how its colours are coded.
+        stream.color_range, stream.colorspace = ColorRange.MPEG, Colorspace.ITU601
+        stream.color_primaries, stream.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1
+        stream.thread_count = 1  # the bytes depend on the number of threads
+        for picture in pictures:
+            frame = av.VideoFrame.from_ndarray(np.pad(picture, grown, mode="edge"), format="rgb24")
+            film.mux(stream.encode(frame))
+        film.mux(stream.encode())
     staged.replace(path)
     return path
