@@ -4,17 +4,18 @@ import base64
 import html
 import json
 import math
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt16
+from jaxtyping import Float, Float32, UInt16
+from torch import Tensor
 
 from ..geometry import SE3, Camera
 from ..model import ArticulatedObject, Splats
 from .overlay import colour_of, joint_strokes
+from .page import filled, page_file
 from .sweep import telling_order
 
 _LEVELS = 65535  # of a 16-bit number
@@ -22,6 +23,7 @@ _LEVELS = 65535  # of a 16-bit number
 _ASIDE = math.radians(40)
 _OUTWARD = 0.1  # of the object's radius
 _AZIMUTHS = 12
+_LOOK_SIZE = 96  # pixels of the pictures that it is chosen by
 _ELEVATION = math.radians(20)
 _HALF_FIELD = math.pi / 9  # of view, as in controls.js
 
@@ -46,16 +48,10 @@ def page_of(obj: ArticulatedObject, *, title: str) -> str:
 
     Joints run over their observed range.  The colours are those without a view-dependent part.
     """
-    fields = {
-        "title": html.escape(title),
-        "style": _page_file("viewer.css"),
-        # No string of the data may end the element that holds it.
-        "scene": json.dumps(scene_of(obj), separators=(",", ":")).replace("<", "\\u003c"),
-        "script": _page_file("viewer.js") + _page_file("controls.js"),
-    }
-    pieces = _page_file("template.html").split("{{")
-    texts = (piece.partition("}}") for piece in pieces[1:])
-    return pieces[0] + "".join(fields[name] + rest for name, _, rest in texts)
+    # No string of the data may end the element that holds it.
+    scene = json.dumps(scene_of(obj), separators=(",", ":")).replace("<", "\\u003c")
+    script = page_file("viewer.js") + "\n" + page_file("controls.js")
+    return filled("viewer.html", title=html.escape(title), style=page_file("viewer.css"), scene=scene, script=script)
 
 
 def scene_of(obj: ArticulatedObject) -> dict[str, Any]:
@@ -119,11 +115,17 @@ def quantised(
     return np.rint((columns - low) / span * _LEVELS).astype(np.uint16), low, high
 
 
-def _rodrigues(splats: Splats) -> torch.Tensor:
+def _rodrigues(splats: Splats) -> Float[Tensor, "N 3"]:
     """Orientations as axis times tan(angle / 4), each in [-1, 1]: three numbers of even precision, none singular."""
     unit = torch.nn.functional.normalize(splats.quats, dim=-1)
     unit = torch.where(unit[:, :1] < 0, -unit, unit)
     return unit[:, 1:] / (1 + unit[:, :1])
+
+
+def opening_camera(obj: ArticulatedObject, size: int) -> Camera:
+    """The camera of a square picture that shows the whole object in both states, from where the page opens."""
+    view = _first_view(obj)
+    return _orbiting(torch.tensor(view["target"]), view["radius"], view["azimuth"], size)
 
 
 def _first_view(obj: ArticulatedObject) -> dict[str, Any]:
@@ -137,25 +139,21 @@ def _first_view(obj: ArticulatedObject) -> dict[str, Any]:
     azimuths = [2 * math.pi * i / _AZIMUTHS for i in range(_AZIMUTHS)]
     if float(out.norm()) > _OUTWARD * radius:
         azimuths = [math.atan2(float(out[1]), float(out[0])) + side * _ASIDE for side in (-1, 1)]
-    cameras = [_orbiting(target, 1.1 * radius / math.sin(_HALF_FIELD), azimuth) for azimuth in azimuths]
+    cameras = [_orbiting(target, radius, azimuth, _LOOK_SIZE) for azimuth in azimuths]
     best = azimuths[telling_order(obj, cameras)[0]]
     return {"target": _rounded(target), "radius": radius, "azimuth": best, "elevation": _ELEVATION}
 
 
-def _orbiting(target: torch.Tensor, distance: float, azimuth: float) -> Camera:
-    """The page's camera in a direction of the horizon, on a small square picture."""
+def _orbiting(target: Float[Tensor, " 3"], radius: float, azimuth: float, size: int) -> Camera:
+    """The page's camera in a direction of the horizon, with a square picture into which a sphere about the target fits."""
     c, s, ce, se = math.cos(azimuth), math.sin(azimuth), math.cos(_ELEVATION), math.sin(_ELEVATION)
     R = torch.tensor([[-s, se * c, -ce * c], [c, se * s, -ce * s], [0.0, -ce, -se]])
-    size = 96
+    distance = 1.1 * radius / math.sin(_HALF_FIELD)
     focal = 0.5 * size / math.tan(_HALF_FIELD)
     return Camera(SE3.from_rotation(R, target.float() - distance * R[:, 2]), focal, focal, size / 2, size / 2, size, size)
 
 
-def _rounded(values: torch.Tensor) -> list[Any]:
+def _rounded(values: Tensor) -> list[Any]:
     """Nested lists, short in JSON; a millionth of a unit is no longer seen."""
     rounded = np.round(values.detach().cpu().double().numpy(), 6)
     return rounded.tolist()
-
-
-def _page_file(name: str) -> str:
-    return files("structuregs.export").joinpath("page", name).read_text(encoding="utf-8").rstrip("\n")
