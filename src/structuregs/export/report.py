@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from PIL import Image
 
 from ..capture import Capture, View, farthest_points, stack_views
@@ -28,7 +29,8 @@ from .sweep import render_sweep, telling_order
 
 _CANDIDATES = 12  # views of each state that the shown ones are chosen from
 _PHOTO_SIZE = 380  # the side of a square with as many pixels as a picture
-_SWEEP_SIZE, _SWEEP_FRAMES, _SWEEP_MS = 360, 30, 100
+_SWEEP_SIZE, _SWEEP_FRAMES, _SWEEP_MS = 480, 30, 100
+_BORDER = 8  # pixels of white around the animation
 _UNCLEAR = 0.5  # a joint of less confidence is a warning
 
 
@@ -79,10 +81,13 @@ def _section(title: str, content: str) -> str:
 def _lead(obj: ArticulatedObject) -> str:
     """What was found, in one sentence."""
     turns = sum(joint.kind == "revolute" for joint in obj.joints)
-    counts = ((turns, "turns", "turn"), (len(obj.joints) - turns, "slides", "slide"))
-    kinds = [f"{count} {one if count == 1 else many}" for count, one, many in counts if count]
-    parts = f"{len(obj.joints)} moving part{'' if len(obj.joints) == 1 else 's'}"
-    return f"A base and {parts}, of which {' and '.join(kinds)}." if kinds else "A base; no part was found to move."
+    slides = len(obj.joints) - turns
+    if turns + slides < 2:
+        return f"A base and one part that {'turns' if turns else 'slides'}." if obj.joints else "A base; nothing moves."
+    kinds = [
+        f"{n} that {one if n == 1 else many}" for n, one, many in ((turns, "turns", "turn"), (slides, "slides", "slide")) if n
+    ]
+    return f"A base and {turns + slides} moving parts: {' and '.join(kinds)}."
 
 
 def _figures(capture: Capture, obj: ArticulatedObject, metrics: list[dict[str, Any]], seconds: float) -> str:
@@ -135,7 +140,7 @@ def _dot(part: int) -> str:
 
 
 def _vector(values: Sequence[float]) -> str:
-    return " ".join(f"{value:+.3f}".replace("-", "−") for value in values)
+    return " ".join(f"{round(value, 3) + 0.0:+.3f}".replace("-", "−") for value in values)
 
 
 def _amount(joint: Joint) -> str:
@@ -198,9 +203,20 @@ def _pairs(views: Sequence[View], splats: Splats, kind: str) -> Iterator[str]:
 def _sweep(obj: ArticulatedObject, camera: Camera) -> str:
     """The joints moving there and back, as an animation's data URL."""
     there = islice(render_sweep(obj, camera, frames=_SWEEP_FRAMES), _SWEEP_FRAMES // 2 + 1)
-    first, *others = (Image.fromarray(rgb) for rgb in there)
+    first, *others = (Image.fromarray(rgb) for rgb in _cropped(np.stack(list(there))))
     back = others[-2::-1]
     return _url(first, "WEBP", save_all=True, append_images=others + back, duration=_SWEEP_MS, loop=0, quality=80)
+
+
+def _cropped(frames: UInt8[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F h w 3"]:
+    """Frames without the rows and columns that are white in all of them, but for a few."""
+    inked = frames.min((0, 3)) < 250
+    spans = []
+    for lines in (inked.any(1), inked.any(0)):
+        (found,) = np.nonzero(lines)
+        low, high = (found[0], found[-1] + 1) if len(found) else (0, len(lines))
+        spans.append(slice(max(low - _BORDER, 0), high + _BORDER))
+    return frames[:, spans[0], spans[1]]
 
 
 def _metrics(file: Path) -> list[dict[str, Any]]:

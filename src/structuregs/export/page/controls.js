@@ -3,6 +3,9 @@
 
 const HALF_FIELD = Math.PI / 9; // of view
 const LOOP_SECONDS = 4; // there and back
+const SLOW_MS = 30; // a picture that takes longer is drawn with fewer pixels while things move
+const COARSEST = 0.35; // of the pixels along a side
+const REST_MS = 200; // without a change, after which the picture is drawn sharp
 
 /** Turns, moves and zooms about a target; z is up. */
 class Orbit {
@@ -122,6 +125,10 @@ class Page {
     this.playing = false;
     this.phase = 0;
     this.waiting = false;
+    this.coarse = 1; // share of the pixels along a side that is drawn while things move
+    this.moving = false;
+    this.rest = null; // the timer that ends moving
+    this.timing = false;
     const panel = document.getElementById("panel");
     this.fill(panel, scene);
     this.orbit = new Orbit(canvas, panel, scene.view, () => this.refresh());
@@ -231,20 +238,46 @@ class Page {
     this.refresh();
   }
 
-  /** Draws with the next frame. */
+  /** Draws with the next frame, and sharp once nothing changes any more. */
   refresh() {
     if (this.waiting || !this.orbit) return;
     this.waiting = true;
+    clearTimeout(this.rest);
     requestAnimationFrame(() => {
       this.waiting = false;
+      this.moving = true;
       this.draw();
+      this.time();
+      this.rest = setTimeout(() => {
+        this.moving = false;
+        if (this.coarse < 1) this.draw();
+      }, REST_MS);
     });
   }
 
   /** Draws now. */
   draw() {
-    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const ratio = Math.min(window.devicePixelRatio || 1, 2) * (this.moving ? this.coarse : 1);
     this.viewer.draw(this.fixed ?? this.orbit.camera(ratio), ratio);
+  }
+
+  /** Waits until what was drawn is there, and chooses how coarse to be from how long that took. */
+  time() {
+    if (this.timing) return;
+    this.timing = true;
+    const { gl } = this.viewer;
+    const begun = performance.now();
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    const look = () => {
+      const waited = performance.now() - begun;
+      if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED && waited < 1000) return setTimeout(look, 4);
+      gl.deleteSync(fence);
+      this.timing = false;
+      if (waited > SLOW_MS) this.coarse = Math.max(0.8 * this.coarse, COARSEST);
+      else if (waited < SLOW_MS / 3) this.coarse = Math.min(1.1 * this.coarse, 1);
+    };
+    setTimeout(look, 4);
   }
 
   /** The picture as it stands, as a PNG's data URL. */

@@ -6,23 +6,21 @@ const NEAR = 0.01;
 const COLUMNS = 16; // 16-bit numbers of a splat: mean 3, rotation 3, log scale 3, rgb 3, opacity 1, tint 3
 const TEXELS = COLUMNS / 4;
 const SPLATS_PER_ROW = 512; // 4 texels each: rows of 2048 texels, which every WebGL2 device allows
+const ORDER_ROW = 2048; // items in a row of the texture that holds the drawing order
 const BUCKETS = 65536;
 const PART_SHIFT = 24; // an item of the drawing order is a splat's number, with its part above it
 
 const POSE_GLSL = `
-uniform highp sampler2D poses; // three texels a part: the rows of its 3 x 4 motion from state 0
-vec3 moved(int part, vec3 p) {
-  vec4 h = vec4(p, 1.0);
-  return vec3(dot(texelFetch(poses, ivec2(0, part), 0), h), dot(texelFetch(poses, ivec2(1, part), 0), h),
-              dot(texelFetch(poses, ivec2(2, part), 0), h));
+uniform highp sampler2D poses; // three texels a part: the rows of its 3 x 4 motion from where it stands in state 0 to the camera
+mat4x3 pose(int part) {
+  return transpose(mat3x4(texelFetch(poses, ivec2(0, part), 0), texelFetch(poses, ivec2(1, part), 0),
+                          texelFetch(poses, ivec2(2, part), 0)));
 }
-uniform mat3 R_camera_world;
-uniform vec3 centre; // of the camera
 uniform vec4 lens; // fx, fy, cx, cy
 uniform vec2 size; // of the picture, pixels
 vec2 pixel(vec3 p) { return lens.xy * p.xy / p.z + lens.zw; }
 vec4 clip(vec2 at) { return vec4(2.0 * at.x / size.x - 1.0, 1.0 - 2.0 * at.y / size.y, 0.0, 1.0); }
-vec2 corner() { return vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0; }
+vec2 corner() { return vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0; }
 `;
 
 const SPLAT_VERTEX = `#version 300 es
@@ -33,7 +31,7 @@ ${POSE_GLSL}
 uniform usampler2D splats;
 uniform vec4 low[${TEXELS}], step_[${TEXELS}]; // value = low + step * number
 uniform float shade; // how much of the tint is added
-in uint item;
+uniform usampler2D order; // items, from far to near
 out vec2 deviations; // from the splat's middle
 out vec4 colour;
 
@@ -48,6 +46,8 @@ mat3 rotation(vec3 m) { // of modified Rodrigues parameters: the axis times tan(
 
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // outside: not drawn
+  int place = gl_VertexID >> 2;
+  uint item = texelFetch(order, ivec2(place % ${ORDER_ROW}, place / ${ORDER_ROW}), 0).r;
   int i = int(item & ${(1 << PART_SHIFT) - 1}u), part = int(item >> ${PART_SHIFT});
   vec4 v[${TEXELS}];
   for (int c = 0; c < ${TEXELS}; c++) {
@@ -56,13 +56,11 @@ void main() {
   }
   vec3 mean = v[0].xyz, turn = vec3(v[0].w, v[1].xy), scale = exp(vec3(v[1].zw, v[2].x)), rgb = v[2].yzw, tint = v[3].yzw;
   float opacity = v[3].x;
-  vec3 p = R_camera_world * (moved(part, mean) - centre);
+  mat4x3 T = pose(part);
+  vec3 p = T * vec4(mean, 1.0);
   if (p.z <= ${NEAR} || opacity * 255.0 <= 1.0) return;
 
-  vec3 origin = moved(part, vec3(0.0));
-  mat3 R_part = mat3(moved(part, vec3(1.0, 0.0, 0.0)) - origin, moved(part, vec3(0.0, 1.0, 0.0)) - origin,
-                     moved(part, vec3(0.0, 0.0, 1.0)) - origin);
-  mat3 axes = R_camera_world * R_part * rotation(turn) * mat3(scale.x, 0.0, 0.0, 0.0, scale.y, 0.0, 0.0, 0.0, scale.z);
+  mat3 axes = mat3(T) * rotation(turn) * mat3(scale.x, 0.0, 0.0, 0.0, scale.y, 0.0, 0.0, 0.0, scale.z);
   // Linearised at most 0.3 half pictures outside, where the projection of wide splats would go astray.
   vec2 margin = 0.15 * size / lens.xy;
   vec2 uv = clamp(p.xy / p.z, -lens.zw / lens.xy - margin, (size - lens.zw) / lens.xy + margin);
@@ -102,8 +100,8 @@ in vec2 part_width;
 out vec3 colour;
 out vec2 across_half; // pixels from the line's middle, and its half width
 void main() {
-  int part = int(part_width.x);
-  vec3 a = R_camera_world * (moved(part, start) - centre), b = R_camera_world * (moved(part, end) - centre);
+  mat4x3 T = pose(int(part_width.x));
+  vec3 a = T * vec4(start, 1.0), b = T * vec4(end, 1.0);
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
   if (max(a.z, b.z) <= ${NEAR}) return;
   vec3 crossing = mix(a, b, (${NEAR} - a.z) / (a.z == b.z ? 1.0 : b.z - a.z));
@@ -139,7 +137,8 @@ class Viewer {
     this.lineProgram = new Program(gl, LINE_VERTEX, LINE_FRAGMENT);
     this.splatTexture = newTexture(gl);
     this.poseTexture = newTexture(gl);
-    this.orderBuffer = gl.createBuffer();
+    this.orderTexture = newTexture(gl);
+    this.cornerBuffer = gl.createBuffer();
     this.lineBuffer = gl.createBuffer();
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
@@ -168,10 +167,22 @@ class Viewer {
     }
     this.depths = new Float32Array(this.count);
     this.items = new Uint32Array(this.count);
-    this.order = new Uint32Array(this.count);
+    this.order = new Uint32Array(Math.max(1, Math.ceil(this.count / ORDER_ROW)) * ORDER_ROW);
     this.heads = new Uint32Array(BUCKETS + 1);
+    this.loadCorners();
     this.q = scene.joints.map(() => 0);
     this.shown = { parts: scene.parts.map(() => true), boxes: false, axes: false };
+  }
+
+  /** The triangles of all splats' squares: one draw of many is far quicker than as many instances of one. */
+  loadCorners() {
+    const { gl } = this;
+    const corners = new Uint32Array(6 * this.count);
+    for (let i = 0; i < this.count; i++) corners.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * i + corner), 6 * i);
+    gl.bindVertexArray(this.splatProgram.array);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.cornerBuffer);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
   }
 
   /** The 3 x 4 motion of a part from state 0, row by row; a part moves with its parent. */
@@ -203,7 +214,10 @@ class Viewer {
     }
     gl.viewport(0, 0, camera.width, camera.height);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    const poses = this.scene.parts.map((_, part) => this.pose(part));
+    const { R, centre } = camera;
+    const offset = [0, 3, 6].map((i) => -(R[i] * centre[0] + R[i + 1] * centre[1] + R[i + 2] * centre[2]));
+    const view = [0, 1, 2].flatMap((i) => [...R.slice(3 * i, 3 * i + 3), offset[i]]);
+    const poses = this.scene.parts.map((_, part) => composed(view, this.pose(part)));
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D, this.poseTexture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 3, poses.length, 0, gl.RGBA, gl.FLOAT, new Float32Array(poses.flat()));
@@ -215,34 +229,30 @@ class Viewer {
 
   drawSplats(camera, poses) {
     const { gl, splatProgram: program } = this;
-    const count = this.sort(camera, poses);
+    const count = this.sort(poses);
     program.use(camera);
     gl.uniform1i(program.at("splats"), 0);
     gl.uniform4fv(program.at("low"), this.scene.low);
     gl.uniform4fv(program.at("step_"), this.step);
     gl.uniform1f(program.at("shade"), this.shade);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
-    gl.bufferData(gl.ARRAY_BUFFER, this.order.subarray(0, count), gl.DYNAMIC_DRAW);
+    gl.uniform1i(program.at("order"), 2);
+    gl.activeTexture(gl.TEXTURE2);
+    gl.bindTexture(gl.TEXTURE_2D, this.orderTexture);
+    const rows = this.order.length / ORDER_ROW;
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ORDER_ROW, rows, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, this.order);
     gl.bindVertexArray(program.array);
-    const item = gl.getAttribLocation(program.handle, "item");
-    gl.enableVertexAttribArray(item);
-    gl.vertexAttribIPointer(item, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(item, 1);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+    gl.drawElements(gl.TRIANGLES, 6 * count, gl.UNSIGNED_INT, 0);
   }
 
   /** Fills the order of drawing, from far to near, by a counting sort of 16-bit depths; the number of items. */
-  sort(camera, poses) {
+  sort(poses) {
     const { means, depths, items, order, heads } = this;
-    const [x, y, z] = camera.R.slice(6);
     let count = 0, nearest = Infinity, farthest = -Infinity, first = 0;
     this.scene.parts.forEach(({ count: size }, part) => {
-      const P = poses[part];
-      const [a, b, c, d] = [0, 1, 2, 3].map((j) => x * P[j] + y * P[4 + j] + z * P[8 + j]);
-      const offset = d - (x * camera.centre[0] + y * camera.centre[1] + z * camera.centre[2]);
+      const [a, b, c, d] = poses[part].slice(8);
       const last = this.shown.parts[part] ? first + size : first;
       for (let i = first; i < last; i++) {
-        const depth = a * means[3 * i] + b * means[3 * i + 1] + c * means[3 * i + 2] + offset;
+        const depth = a * means[3 * i] + b * means[3 * i + 1] + c * means[3 * i + 2] + d;
         if (depth <= NEAR) continue;
         if (depth < nearest) nearest = depth;
         if (depth > farthest) farthest = depth;
@@ -330,8 +340,6 @@ class Program {
   use(camera) {
     const { gl } = this;
     gl.useProgram(this.handle);
-    gl.uniformMatrix3fv(this.at("R_camera_world"), true, camera.R);
-    gl.uniform3fv(this.at("centre"), camera.centre);
     gl.uniform4f(this.at("lens"), camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform2f(this.at("size"), camera.width, camera.height);
     gl.uniform1i(this.at("poses"), 1);
