@@ -51,8 +51,8 @@ def without_tint(obj: ArticulatedObject) -> ArticulatedObject:
     return replace(obj, parts=replace(obj.parts, tint=torch.zeros_like(obj.parts.tint)))
 
 
-def rendered(splats: Splats) -> np.ndarray:
-    return render(splats, CAMERA).rgb.clamp(0, 1).numpy()
+def rendered(splats: Splats, camera: Camera = CAMERA) -> np.ndarray:
+    return render(splats, camera).rgb.clamp(0, 1).numpy()
 
 
 def closeness(a: np.ndarray, b: np.ndarray) -> float:
@@ -126,10 +126,10 @@ def page(browser, obj, tmp_path):
     return browser
 
 
-def look_through_camera(browser: Browser) -> None:
-    T = CAMERA.T_world_camera
-    record = {"R": T.rotation.T.flatten().tolist(), "centre": T.xyz.tolist(), "width": CAMERA.width, "height": CAMERA.height}
-    record |= {name: getattr(CAMERA, name) for name in ("fx", "fy", "cx", "cy")}
+def look_through_camera(browser: Browser, camera: Camera = CAMERA) -> None:
+    T = camera.T_world_camera
+    record = {"R": T.rotation.T.flatten().tolist(), "centre": T.xyz.tolist()}
+    record |= {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     browser.run(f"viewer.setCamera({json.dumps(record)})")
 
 
@@ -145,6 +145,14 @@ def test_the_picture_is_the_renderers(browser, obj, tmp_path, share):
     q = [share * joint.q[1] for joint in obj.joints]
     browser.run(f"viewer.setJoints({q})")
     assert closeness(browser.image("viewer.picture()"), rendered(obj.at(q))) > 40
+
+
+@needs_browser
+def test_splats_thinner_than_a_pixel_are_the_renderers_too(browser, obj, tmp_path):
+    camera = CAMERA.resized(40, 30)
+    browser.open(export_html(obj, tmp_path / "page.html"))
+    look_through_camera(browser, camera)
+    assert closeness(browser.image("viewer.picture()"), rendered(obj.at([0.0] * 4), camera)) > 40
 
 
 @needs_browser
