@@ -22,11 +22,11 @@ LEVELS = {
     "raster": 2,
     "points": 2,
     "boxes": 3,
-    "joints": 3,
+    "joints": 2,
     "synthetic": 3,
     "fit": 4,
     "export": 5,
-    "evaluate": 5,
+    "evaluate": 6,
 }
 DOORS = {"__init__", "cli"}
 # The one room that may import a heavy package.

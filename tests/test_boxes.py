@@ -133,7 +133,7 @@ class TestCandidates:
         torch.testing.assert_close(landed, true.apply(box.T_world_box.xyz).expand(24, 3))
         gaps = torch.cdist(stacked.rotation.reshape(24, 9), stacked.rotation.reshape(24, 9)) + torch.eye(24)
         assert gaps.min() > 0.9, "24 different turns"
-        without, with_target = (candidate_motions(box, box, targets) for targets in ([], [box.moved(true)]))
+        without, with_target = (candidate_motions(box, box, pairs) for pairs in ([], [(box, box.moved(true))]))
         assert len(with_target.wxyz_xyz) == len(without.wxyz_xyz) + 24
 
     def test_hinges_are_the_edges_the_lines_between_and_some_beyond(self):

@@ -251,7 +251,7 @@ PLAIN = replace(PRESETS["paper"], image_from=0, structure_size=24, one_joint_fro
 
 class TestOptimiser:
     def test_is_adam(self):
-        """The same random gradients through `torch.optim.Adam`."""
+        """The same random gradients through `torch.optim.Adam`; a motion's are of one size, so that sharing it is no matter."""
         config = replace(PLAIN, steps=1000, structure_until=1000, rates=Rates(final=1.0, appearance_final=1.0))
         fit = fitter(config)
         leaves = fit.state.variables.leaves
@@ -263,6 +263,8 @@ class TestOptimiser:
             fit.state.step = step
             for name, leaf in leaves.items():
                 leaf.grad = torch.randn(leaf.shape, generator=g)
+                if name == "motions":
+                    leaf.grad = leaf.grad.sign() * leaf.grad[:, :1].abs()
                 mirror[name].grad = leaf.grad.clone()
             fit._adam()
             reference.step()
@@ -271,6 +273,30 @@ class TestOptimiser:
             first, second = fit.state.moments[name]
             torch.testing.assert_close(first, reference.state[mirror[name]]["exp_avg"])
             torch.testing.assert_close(second, reference.state[mirror[name]]["exp_avg_sq"])
+
+    def test_a_motion_goes_where_its_gradient_points(self):
+        """Of a direction that the photos hardly see, Adam would make as much as of the others."""
+        fit = fitter(replace(PLAIN, steps=1000, structure_until=1000))
+        leaf = fit.state.variables.leaves["motions"]
+        before = leaf.detach().clone()
+        gradient = torch.tensor([3.0, -2.0, 1.0, 0.1, 0.0, -0.01]).repeat(len(leaf), 1)
+        leaf.grad = gradient.clone()
+        fit._adam()
+        step = leaf.detach() - before
+        rate = fit.config.rates.motions
+        torch.testing.assert_close(
+            step, -rate * gradient / gradient.square().mean(-1, keepdim=True).sqrt(), rtol=1e-4, atol=1e-8
+        )
+
+    def test_a_leaf_that_joins_late_takes_no_larger_steps(self):
+        """Moments begin at zero whenever a leaf's first gradient comes; the correction must begin there too."""
+        fit = fitter(replace(PLAIN, steps=1000, structure_until=1000, rates=Rates(final=1.0, appearance_final=1.0)))
+        leaf = fit.state.variables.leaves["sh"]
+        fit.state.step = 700
+        before = leaf.detach().clone()
+        leaf.grad = torch.ones_like(leaf)
+        fit._adam()
+        torch.testing.assert_close(before - leaf.detach(), torch.full_like(leaf, Rates().sh), rtol=1e-3, atol=1e-8)
 
     @pytest.mark.parametrize(("name", "final"), [("means", 0.02), ("motions", 0.02), ("box_centres", 0.02), ("sh", 0.2)])
     def test_rates_fall_by_a_constant_factor_a_step(self, name: str, final: float):

@@ -30,7 +30,6 @@ TINY = FitConfig(
     structure_until=20,
     loose_until=20,
     image_from=20,
-    motions_first=20,
     structure_size=48,
     sizes=((0.0, 48), (0.5, 64)),
     checkpoint_every=40,

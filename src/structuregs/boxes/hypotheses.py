@@ -38,15 +38,15 @@ class Hypothesis:
     oddity: float
     image_error: float = float("inf")
 
-    def cost(self, gain: float) -> float:
+    def cost(self, weight: float) -> float:
         """What hypotheses are compared by: the image error, raised for what else speaks against the motion.
 
-        Light that stays in the world while a part turns can make a mirrored pose look better than the true one; therefore
-        what is odd about a motion, and what the masks say, count as shares of `gain`, the most that any hypothesis takes off
-        the error.
+        Light that stays in the world while a part turns can make a mirrored pose look better than the true one, and what is
+        shut shows little of itself; therefore what is odd about a motion, and what the masks say, count as shares of
+        `weight`: what the photos of the part's own state would lose without it, in mean error.
         """
-        against = 0.2 * self.oddity + 0.2 * min(self.outside, 1.0) + 0.1 * self.unexplained
-        return self.image_error + gain * against
+        against = 0.1 * self.oddity + 0.2 * min(self.outside, 1.0) + 0.1 * self.unexplained
+        return self.image_error + weight * against
 
 
 def hinge_screws(box: Box) -> list[Screw]:
@@ -88,8 +88,14 @@ def registrations(box: Box, target: Box) -> list[SE3]:
     return motions
 
 
-def candidate_motions(box: Box, base: Box, targets: list[Box]) -> SE3:
-    """All motions worth a look for a cluster's box: M rigid motions of the world, float64."""
+def candidate_motions(box: Box, base: Box, pairs: list[tuple[Box, Box]]) -> SE3:
+    """All motions worth a look for a cluster: M rigid motions of the world, float64.
+
+    Args:
+        box: of the cluster; its hinges and slides are tried.
+        base: the base's box, for more slides.
+        pairs: boxes of what may be one part in the cluster's state and in the other; the one is laid upon the other.
+    """
     rows = [SE3.identity(dtype=torch.float64).wxyz_xyz]
     for screw in hinge_screws(box):
         rows += [screw.motion(sign * angle).wxyz_xyz for angle in _ANGLES for sign in (1, -1)]
@@ -98,8 +104,8 @@ def candidate_motions(box: Box, base: Box, targets: list[Box]) -> SE3:
         along = box.T_world_box.rotation.T @ screw.axis
         size = max(float((along.abs() * 2 * box.half_extents).sum()), 0.2 * reach)
         rows += [screw.motion(sign * length * size).wxyz_xyz for length in _LENGTHS for sign in (1, -1)]
-    for target in targets:
-        rows += [motion.wxyz_xyz for motion in registrations(box, target)]
+    for source, target in pairs:
+        rows += [motion.wxyz_xyz for motion in registrations(source, target)]
     return SE3(torch.stack(rows))
 
 

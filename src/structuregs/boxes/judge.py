@@ -5,9 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
+from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from ..geometry import SE3, Box, screw_at
+from ..joints import kind_of
 from ..model import Splats
 from ..raster import image_loss, render
 from .cue import StateLook
@@ -103,15 +105,35 @@ def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, base:
     slide, length = screw_at(motion, "prismatic", centre)
     turn, angle = screw_at(motion, "revolute", centre)
     axes = torch.cat([box.T_world_box.rotation.T, base.T_world_box.rotation.T])
-    candidates = [slide.motion(length), turn.motion(angle)]
+    candidates = [(slide, length), (turn, angle)]
     for screw, q in ((turn, angle), (slide, length)):
         along = axes @ screw.axis
         nearest = int(along.abs().argmax())
         if abs(float(along[nearest])) > np.cos(np.deg2rad(15)):
-            candidates.insert(0, replace(screw, axis=axes[nearest]).motion(q * float(along[nearest])))
+            candidates.insert(0, (replace(screw, axis=axes[nearest]), q * float(along[nearest])))
     enough = hypothesis.image_error + 0.05 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent
-    for simple in candidates:
-        judged = scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
-        if judged.image_error < enough:
-            return judged
+    for screw, q in candidates:
+        if scene.error(part, screw.motion(q)) < enough:
+            simple = screw.motion(q)
+            return scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
     return hypothesis
+
+
+def measured(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box) -> Hypothesis:
+    """The hypothesis, turned or slid a little more or less along its own axis as the photos see it, within a tenth.
+
+    Args:
+        hypothesis: a motion with its image error.
+        scene: the photos, and the rest.
+        part: the part's splats in its own state.
+        box: the part's box in its own state.
+    """
+    screw, q = screw_at(hypothesis.motion, kind_of(hypothesis.motion), box.T_world_box.xyz)
+
+    def error(at: float) -> float:
+        return scene.error(part, screw.motion(float(at)))
+
+    found = minimize_scalar(error, bounds=(0.9 * q, 1.1 * q), method="bounded", options={"maxiter": 12})
+    q = float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
+    again = scene.judge(replace(hypothesis, motion=screw.motion(q)), part)
+    return min(hypothesis, again, key=lambda h: h.image_error)

@@ -1,5 +1,6 @@
 """From clusters of what moved to moving parts: each a box in state 0 and the motion that the photos like best."""
 
+import itertools
 from collections.abc import Generator
 from dataclasses import dataclass, field, replace
 
@@ -11,7 +12,7 @@ from ..geometry import SE3, Box
 from ..model import Splats
 from .cue import CueConfig, StateLook, box_around, clusters
 from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, hull_scores, oddity, stack_motions
-from .judge import NOISE, Scene, refine, simplest
+from .judge import NOISE, Scene, measured, refine, simplest
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,10 @@ class SearchConfig:
     """The motion cue."""
     most: int = 12
     """Clusters that are looked at, the largest first."""
+    together: int = 3
+    """A part may show as several clusters of a state: the boxes of so many with any one are laid upon the other state's."""
+    clear: float = 3.0
+    """Splats this near to a cluster's box, in voxels, belong to it."""
     shortlist: int = 110
     """Hypotheses per cluster that pass the hull and are shown to the photos."""
     finalists: int = 3
@@ -34,10 +39,12 @@ class SearchConfig:
     """Of a finalist's pose: radians, and parts of the box's half diagonal."""
     same: float = 0.3
     """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
-    alike: float = 0.75
-    """...and if moving it like the other takes this fraction of the best gain off the photo error."""
+    alike: float = 0.25
+    """...and if moving it like the other costs the photos less than this fraction of the part's weight."""
     large: float = 0.03
-    """A part need not do more than no harm to the photos if it holds this fraction of its state's points."""
+    """A part that holds this fraction of its state's points came from somewhere: it is kept if it does little harm..."""
+    harm: float = 0.01
+    """...and adds less than this fraction to the photo error; what is shut may show in no photo."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,7 @@ class MovingPart:
         points: of its surface, in that state, in the world.
         hypothesis: its motion from `state` to the other state.
         gain: fraction that it takes off the error of the other state's photos.
+        weight: what the photos of its own state would lose without it, in mean error.
         rivals: what the photos thought of the next best distinct motions.
     """
 
@@ -56,6 +64,7 @@ class MovingPart:
     points: Float64[np.ndarray, "P 3"]
     hypothesis: Hypothesis
     gain: float
+    weight: float
     rivals: tuple[Hypothesis, ...] = ()
 
     @property
@@ -98,7 +107,7 @@ class PartSearch:
     def _inside(self, splats: Splats, boxes: list[Box]) -> torch.Tensor:
         inside = torch.zeros(len(splats), dtype=torch.bool)
         for box in boxes:
-            inside |= box.contains(splats.means.double(), margin=self.voxel)
+            inside |= box.contains(splats.means.double(), margin=self.config.clear * self.voxel)
         return inside
 
     def _judges(self, state: int) -> np.ndarray:
@@ -124,13 +133,13 @@ class PartSearch:
                 continue
             part, members = self._try(index, parts, explained)
             share = len(part.points) / len(self.looks[part.state].points)
-            if part.gain < (0.0 if share > self.config.large else NOISE):
+            if part.gain < (-self.config.harm if share > self.config.large else NOISE):
                 continue
             parts.append(part)
             explained |= members | self._explained_by(part)
         if len(parts) > 1:
             parts = self._settled(self._without_pieces(self._reconsider(parts)))
-        return sorted(parts, key=lambda part: -part.gain)
+        return sorted(parts, key=lambda part: -part.weight)
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
         """Looks at each part again with all others in place; one that may as well move like another becomes one with it."""
@@ -144,15 +153,14 @@ class PartSearch:
             own = part.hypothesis
             guests = [replace(own, motion=T, oddity=oddity(T, box)) for T in shared]
             starts = [own, *part.rivals[:2], *guests]
-            again = [refine(h, scene, piece, box, self.config.steps, self.config.rate) for h in starts]
-            gains = [absent - h.image_error for h in again]
-            most = max(*gains, 1e-12)
-            by_cost = sorted(again, key=lambda h: h.cost(most))
+            again = [self._pulled(h, scene, piece, box, absent, part.weight, self.config.steps) for h in starts]
+            by_cost = sorted(again, key=lambda h: h.cost(part.weight))
             gaps = displacements(SE3(torch.stack([T.wxyz_xyz for T in shared])), by_cost[0].motion, box)
-            likeness = np.where(gaps < self.config.same, np.array(gains[-len(shared) :]) / most, 0.0)
+            losses = np.array([h.image_error for h in again[-len(shared) :]]) - min(h.image_error for h in again)
+            losses = np.where(gaps < self.config.same, losses, np.inf)
 
-            twin = int(np.argmax(likeness))
-            if likeness[twin] > self.config.alike:
+            twin = int(np.argmin(losses))
+            if losses[twin] < self.config.alike * part.weight:
                 parts = self._merged(others[twin], part, [p for p in others if p is not others[twin]])
                 index = 0
                 continue
@@ -189,11 +197,18 @@ class PartSearch:
         for index, part in enumerate(parts):
             box, piece, scene, absent = self._again(part, parts[:index] + parts[index + 1 :])
             starts = [part.hypothesis, *part.rivals[:1]]
-            again = [refine(h, scene, piece, box, 2 * self.config.steps, self.config.rate) for h in starts]
-            gain = max(absent - min(h.image_error for h in again), 0.0)
-            best = min(again, key=lambda h: h.cost(gain))
-            parts[index] = replace(part, hypothesis=simplest(best, scene, piece, box, self.base_box, absent))
+            again = [self._pulled(h, scene, piece, box, absent, part.weight, 2 * self.config.steps) for h in starts]
+            best = min(again, key=lambda h: h.cost(part.weight))
+            parts[index] = replace(part, hypothesis=measured(best, scene, piece, box))
         return parts
+
+    def _pulled(
+        self, start: Hypothesis, scene: Scene, piece: Splats, box: Box, absent: float, weight: float, steps: int
+    ) -> Hypothesis:
+        """The simplest motion that does where the photos pull a hypothesis, or the hypothesis, if all in all it is better."""
+        refined = refine(start, scene, piece, box, steps, self.config.rate)
+        simple = simplest(refined, scene, piece, box, self.base_box, absent)
+        return min(simple, scene.judge(start, piece), key=lambda h: h.cost(weight))
 
     def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
         """The parts with two of them made one, which moves as the leader does."""
@@ -226,7 +241,8 @@ class PartSearch:
         open_ = [i for i in range(len(self.clusters)) if i not in done]
         arrivals = [i for i in open_ if self.clusters[i].state == other]
         siblings = [i for i in open_ if self.clusters[i].state == state and i != index]
-        motions = candidate_motions(box, self.base_box, [self.boxes[i] for i in arrivals])
+        pairs = list(itertools.product(self._unions(siblings, {index}), self._unions(arrivals, set())))
+        motions = candidate_motions(box, self.base_box, pairs)
         landing = np.concatenate([self.clusters[i].points for i in arrivals]) if arrivals else np.zeros((0, 3))
         landing = self._sample(landing, 300)
         outside, unexplained = hull_scores(motions, self._sample(cluster.points, 300), target.hull, landing, box)
@@ -248,33 +264,39 @@ class PartSearch:
                 motion = motions[int(m)]
                 start = Hypothesis(motion, float(outside[m]), float(unexplained[m]), oddity(motion, box))
                 judged.append((scene.judge(start, self._piece({index, *group}), quick=True), group))
+        weight = self._weight({index})
         refined = []
-        for start, group in self._finalists(judged, box, absent):
+        for start, group in self._finalists(judged, box, weight):
             piece = self._piece({index, *group})
-            refined.append((refine(start, scene, piece, box, self.config.steps, self.config.rate), group))
-        gain = max(absent - min(h.image_error for h, _ in refined), 0.0)
-        refined.sort(key=lambda row: row[0].cost(gain))
+            refined.append((self._pulled(start, scene, piece, box, absent, weight, self.config.steps), group))
+        refined.sort(key=lambda row: row[0].cost(weight))
         chosen = distinct(stack_motions([h for h, _ in refined]), box, 0.1, len(refined))
         refined = [refined[c] for c in chosen]
         best, group = refined[0]
-        best = simplest(best, scene, self._piece({index, *group}), box, self.base_box, absent)
         members = {index, *group}
+        best = measured(best, scene, self._piece(members), box)
         points = np.concatenate([self.clusters[i].points for i in sorted(members)])
         gain = (absent - best.image_error) / absent
-        return MovingPart(state, points, best, gain, tuple(rival for rival, _ in refined[1:])), members
+        return MovingPart(state, points, best, gain, weight, tuple(rival for rival, _ in refined[1:])), members
+
+    def _unions(self, indices: list[int], always: set[int]) -> list[Box]:
+        """Boxes of what may be one part: the clusters in `always` with none, one, two or all of the largest others."""
+        largest = indices[: self.config.together]
+        groups = {frozenset(always | set(some)) for n in (0, 1, 2, len(largest)) for some in itertools.combinations(largest, n)}
+        points = [np.concatenate([self.clusters[i].points for i in sorted(g)]) for g in sorted(groups, key=sorted) if g]
+        return [self._box(p) for p in points]
 
     def _finalists(
-        self, judged: list[tuple[Hypothesis, frozenset[int]]], box: Box, absent: float
+        self, judged: list[tuple[Hypothesis, frozenset[int]]], box: Box, weight: float
     ) -> list[tuple[Hypothesis, frozenset[int]]]:
         """The best by the photos and, where these see little of a part or in another light, the best by the masks.
 
         Args:
             judged: hypotheses in the masks' order, each with the clusters that move along.
             box: of the cluster.
-            absent: error of the photos without the part.
+            weight: of the part in the photos of its own state (see `Hypothesis.cost`).
         """
-        gain = max(absent - min(h.image_error for h, _ in judged), 0.0)
-        by_photos = sorted(judged, key=lambda row: row[0].cost(gain))
+        by_photos = sorted(judged, key=lambda row: row[0].cost(weight))
         rows = []
         for order in (by_photos, judged):
             chosen = distinct(stack_motions([start for start, _ in order]), box, 0.15, self.config.finalists)
@@ -285,6 +307,14 @@ class PartSearch:
         """The splats of the clusters in `members`, all of one state."""
         splats = self.looks[self.clusters[min(members)].state].splats
         return splats[self._inside(splats, [self.boxes[i] for i in sorted(members)])]
+
+    def _weight(self, members: set[int]) -> float:
+        """What the photos of their own state lose without these clusters."""
+        state = self.clusters[min(members)].state
+        splats = self.looks[state].splats
+        inside = self._inside(splats, [self.boxes[i] for i in sorted(members)])
+        scene, piece = Scene(self.looks[state], splats[~inside], self._judges(state)), splats[inside]
+        return max(scene.absent(piece) - scene.error(piece, SE3.identity(dtype=torch.float64)), 0.0)
 
     def _rest(self, parts: list[MovingPart], state: int) -> Splats:
         """All that stands still in `state`, with the parts found so far as they stand in the other state."""

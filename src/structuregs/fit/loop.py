@@ -1,13 +1,14 @@
 """The fit's loop: posed parts in, better posed parts out, one view of either state a step."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from pickle import UnpicklingError
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..capture import Capture, ImageStack, stack_views
@@ -22,6 +23,7 @@ from .structure import StructureWeights, contact_loss, structure_loss
 from .variables import SPLAT_NAMES, Variables
 
 _REPORT_EVERY = 10
+_SQUARE_WITHIN = float(np.sin(np.deg2rad(4))) ** 2
 _BOX_NAMES = ("box_quats", "box_centres", "log_half_extents")
 # What torch raises over a file that was cut short or is something else, and what reading another record raises.
 _DAMAGED = (RuntimeError, EOFError, OSError, UnpicklingError, AttributeError, KeyError, TypeError, ValueError)
@@ -34,6 +36,7 @@ class FitState:
     Attributes:
         variables: what is being fitted.
         moments: Adam's two moments of every leaf.
+        taken: Adam's steps of every leaf since its moments were last zero.
         gradients: screen-space gradients since the last round of densification.
         free_motions: the K motions (wxyz_xyz) as they were when they were still free.
         size: of the object, about its radius, as the boxes had it before the first step; world units.
@@ -42,6 +45,7 @@ class FitState:
 
     variables: Variables
     moments: dict[str, tuple[Tensor, Tensor]]
+    taken: dict[str, int]
     gradients: ScreenGradients
     free_motions: Tensor
     size: float
@@ -53,7 +57,15 @@ class FitState:
         variables = Variables.of(parts)
         gradients = ScreenGradients.zeros(sum(parts.counts), parts.tint.device)
         size = float(parts.boxes.half_extents.norm(dim=-1).max())
-        return FitState(variables, _no_moments(variables), gradients, parts.motions.wxyz_xyz.clone(), size, 0)
+        return FitState(
+            variables,
+            _no_moments(variables),
+            dict.fromkeys(variables.leaves, 0),
+            gradients,
+            parts.motions.wxyz_xyz.clone(),
+            size,
+            0,
+        )
 
     def save(self, file: Path) -> None:
         """Writes the checkpoint aside and renames it."""
@@ -65,6 +77,7 @@ class FitState:
             "start": v.start,
             "centres": v.centres,
             "moments": self.moments,
+            "taken": self.taken,
             "gradients": (self.gradients.total, self.gradients.seen),
             "free_motions": self.free_motions,
             "size": self.size,
@@ -86,7 +99,8 @@ class FitState:
             r = torch.load(content, map_location=device, weights_only=True)
             leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
             variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
-            return FitState(variables, r["moments"], ScreenGradients(*r["gradients"]), r["free_motions"], r["size"], r["step"])
+            gradients = ScreenGradients(*r["gradients"])
+            return FitState(variables, r["moments"], r["taken"], gradients, r["free_motions"], r["size"], r["step"])
         except _DAMAGED as error:
             raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
 
@@ -141,7 +155,7 @@ class Fitter:
             kinds: list[JointKind] = [kind_of(motions[k]) for k in range(1, len(variables.counts))]
             variables.hold(kinds)
             first, second = self.state.moments["motions"]
-            self.state.moments["motions"] = (torch.zeros_like(first), torch.zeros_like(second))
+            self.state.moments["motions"], self.state.taken["motions"] = (torch.zeros_like(first), torch.zeros_like(second)), 0
             if kinds:
                 yield Note(f"joints at step {self.state.step}: {', '.join(kinds)}")
 
@@ -208,6 +222,8 @@ class Fitter:
             )
             if (self.state.step + 1) % _REPORT_EVERY == 0:
                 squares.append(float((picture.rgb.detach() - rgb).square().mean()))
+        if config.slide_along_base and self.state.variables.kinds is not None:
+            loss = loss + config.slide_along_base * askew(parts, self.state.variables.kinds)
         if config.tint_penalty:
             loss = loss + config.image_weight * config.tint_penalty * parts.tint.abs().mean()
         return loss, renders, -10 * float(np.log10(max(np.mean(squares), 1e-12))) if squares else None
@@ -221,20 +237,24 @@ class Fitter:
         if name == "motions" and self.state.step < config.image_from and not config.motions_with_structure:
             return 0.0
         final = rates.final if name in ("means", "motions") else rates.appearance_final
-        held = name in SPLAT_NAMES and self.state.step < config.image_from + config.motions_first
-        return getattr(rates, name) * final**done * (0.1 if held else 1.0)
+        return getattr(rates, name) * final**done
 
     @torch.no_grad()
     def _adam(self) -> None:
-        """Adam (Kingma and Ba 2015), leaf by leaf."""
-        t = self.state.step + 1
-        correction = np.sqrt(1 - 0.999**t) / (1 - 0.9**t)
+        """Adam (Kingma and Ba 2015), leaf by leaf.
+
+        A motion's six directions share one second moment: scaled each by itself, those of which the photos say little would be
+        driven about by noise as fast as the others move for a reason.
+        """
         for name, leaf in self.state.variables.leaves.items():
             rate = self._rate(name)
             if leaf.grad is not None and rate:
+                self.state.taken[name] = t = self.state.taken[name] + 1
                 first, second = self.state.moments[name]
                 first.lerp_(leaf.grad, 0.1)
-                second.mul_(0.999).addcmul_(leaf.grad, leaf.grad, value=0.001)
+                square = leaf.grad.square()
+                second.lerp_(square.mean(-1, keepdim=True).expand_as(square) if name == "motions" else square, 0.001)
+                correction = np.sqrt(1 - 0.999**t) / (1 - 0.9**t)
                 leaf.addcdiv_(first, second.sqrt().add_(1e-15), value=-rate * correction)
             leaf.grad = None
 
@@ -255,6 +275,20 @@ class Fitter:
         if growing and growth.reset and (step + 1) % growth.reset == 0:
             with torch.no_grad():
                 self.state.variables.leaves["logit_opacities"].clamp_(max=float(np.log(0.01 / 0.99)))
+
+
+def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
+    """Sum over slides of the squared sine of the angle to the nearest axis of the base's box, no more than at 4 degrees.
+
+    Drawers run square to what holds them, and the photos of a plain one say little about its direction.
+    """
+    axes = parts.boxes.T_world_box.rotation[0].detach().T
+    total = axes.new_zeros(())
+    for k, kind in enumerate(kinds, start=1):
+        if kind == "prismatic":
+            direction = torch.nn.functional.normalize(parts.motions.xyz[k], dim=0)
+            total = total + (1 - (axes @ direction).square().max()).clamp(max=_SQUARE_WITHIN)
+    return total
 
 
 def moving_alike(parts: PosedParts) -> tuple[int, int] | None:

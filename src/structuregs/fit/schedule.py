@@ -23,7 +23,7 @@ class Rates:
     """Of the colour difference between the states, rgb."""
     boxes: float = 3e-3
     """Of the boxes' poses and half extents (T_0), radians and world units."""
-    motions: float = 3e-3
+    motions: float = 4e-3
     """Of the motions (T_1), radians and world units."""
     final: float = 0.02
     """Fraction of its start that the rates of centres, boxes and motions have fallen to at the end."""
@@ -73,8 +73,6 @@ class FitConfig:
     """Step at which contact and extent end."""
     image_from: int = 150
     """Step at which the image loss begins."""
-    motions_first: int = 150
-    """Steps with images during which splats hardly change, so that what does not fit moves the parts."""
     structure_size: int = 96
     """Size of the structure images: the side of a square with as many pixels."""
     motions_with_structure: bool = False
@@ -89,6 +87,8 @@ class FitConfig:
     """Of the mask's error beside the colour's."""
     tint_penalty: float = 0.3
     """Of the mean absolute colour difference between the states."""
+    slide_along_base: float = 1.0
+    """Of the squared sine of the angle between a slide and the nearest axis of the base's box, once joints are held."""
     join_at: float = 0.35
     """Part of the fit after which parts that touch and move alike are made one."""
     one_joint_from: float = 0.6
@@ -119,11 +119,11 @@ PRESETS: dict[str, FitConfig] = {
         structure_until=10_000,
         loose_until=1500,
         image_from=400,
-        motions_first=0,
         motions_with_structure=True,
         sizes=((0.0, 1600),),
         alpha_weight=0.0,
         tint_penalty=0.0,
+        slide_along_base=0.0,
         one_joint_from=1.0,
         checkpoint_every=500,
         rates=Rates(
