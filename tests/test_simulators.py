@@ -358,11 +358,26 @@ def test_every_mesh_has_the_inertia_of_a_body(mesh):
 
 
 def test_pieces_leave_a_drawer_hollow():
-    outer = trimesh.creation.box(extents=(0.6, 0.6, 0.4))
-    ring = trimesh.creation.annulus(0.25, 0.3, 0.5)
-    solid = sum(piece.volume for piece in convex_pieces(ring))
-    assert solid == pytest.approx(ring.volume, rel=0.25)
-    assert len(convex_pieces(ring)) > 3 and len(convex_pieces(outer)) == 1
+    """The walls' middles lie in a piece, and the middle of the hollow in none."""
+    walls = [((0.6, 0.5, 0.04), (0, 0, -0.18)), ((0.6, 0.04, 0.4), (0, 0.23, 0)), ((0.6, 0.04, 0.4), (0, -0.23, 0))]
+    walls += [((0.04, 0.5, 0.4), (0.28, 0, 0)), ((0.04, 0.5, 0.4), (-0.28, 0, 0))]
+    matrices = [trimesh.transformations.translation_matrix(place) for _, place in walls]
+    tray = trimesh.util.concatenate([trimesh.creation.box(size, T) for (size, _), T in zip(walls, matrices, strict=True)])
+    pieces = convex_pieces(tray)
+    inside = [
+        any(np.all(((point - piece.triangles[:, 0]) * piece.face_normals).sum(1) < 0) for piece in pieces)
+        for point in np.array([(0, 0, 0.02), (0.28, 0, 0), (-0.28, 0, 0), (0, 0.23, 0), (0, -0.23, 0), (0, 0, -0.18)])
+    ]
+    assert inside == [False, True, True, True, True, True]
+
+
+def test_sapien_and_moveit_are_told_that_no_links_collide(mechanism, tmp_path):
+    """SAPIEN heeds pairs of the reason "Default", and refuses them between a part and what it hangs on."""
+    write_urdf(mechanism, tmp_path)
+    for name in ("object.srdf", "object_novisual.srdf"):
+        rows = ElementTree.parse(tmp_path / name).getroot().findall("disable_collisions")
+        found = {(row.get("link1"), row.get("link2")): row.get("reason") for row in rows}
+        assert found == {("base", "part_1"): "Adjacent", ("base", "part_2"): "Adjacent", ("part_1", "part_2"): "Default"}
 
 
 def test_an_empty_mesh_is_its_part_s_box(obj):

@@ -11,6 +11,7 @@ from .assets import checked_name, collision_name, mean_colour, number, numbers, 
 from .links import Link, LinkJoint, Mechanism, mechanism_of
 
 _MESHES = "meshes"
+_SAPIEN_PAIRS = 31  # SAPIEN refuses an SRDF that asks it to ignore more pairs
 
 
 def export_urdf(
@@ -31,7 +32,7 @@ def write_urdf(mechanism: Mechanism, folder: Path, *, name: str = "object") -> P
     """Writes `<name>.urdf` and the meshes that it refers to; returns it.
 
     Beside it: `<name>_novisual.urdf`, the same without visuals, which SAPIEN loads on a machine without a GPU; and an SRDF
-    for each, from which SAPIEN and MoveIt learn that no two links should collide.
+    for each, from which SAPIEN (up to 31 pairs) and MoveIt learn that no two links should collide.
 
     The base hangs on a link named `world`, at which PyBullet, ROS and Gazebo fix it.  PyBullet tests no contacts between
     links of one model unless it is asked to; SAPIEN, Isaac and Gazebo none between a part and what it hangs on.  MuJoCo
@@ -114,9 +115,14 @@ def _add_ends(joint: ElementTree.Element, parent: str, child: str, xyz: str) -> 
 
 
 def _srdf(mechanism: Mechanism, name: str) -> ElementTree.Element:
+    """Pairs of links that should not collide; SAPIEN heeds those whose reason is "Default", MoveIt all."""
     robot = ElementTree.Element("robot", name=name)
-    for a, b in mechanism.pairs():
-        ElementTree.SubElement(robot, "disable_collisions", link1=a, link2=b, reason="Adjacent")
+    hung = {frozenset((mechanism.links[j.parent].name, mechanism.links[j.child].name)) for j in mechanism.joints}
+    pairs = list(mechanism.pairs())
+    many = len(pairs) - len(hung) > _SAPIEN_PAIRS
+    for a, b in pairs:
+        reason = "Adjacent" if frozenset((a, b)) in hung else "Never" if many else "Default"
+        ElementTree.SubElement(robot, "disable_collisions", link1=a, link2=b, reason=reason)
     return robot
 
 
