@@ -5,10 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from door_and_drawer import CENTRES, DOOR, DRAWER, made_of, photographed
 from structuregs.capture import TrueJoint, Truth
-from structuregs.evaluate import evaluate_object, evaluate_run, match_joints, score_joints, write_report
+from structuregs.evaluate import (
+    SURFACE_PROTOCOLS,
+    evaluate_object,
+    evaluate_run,
+    match_joints,
+    score_joints,
+    score_surfaces,
+    write_report,
+)
+from structuregs.evaluate.surfaces import seen_points
 from structuregs.geometry import SE3, Screw
 from structuregs.model import save_object
 
@@ -163,3 +173,87 @@ def test_a_folder_that_is_no_run_is_a_sentence(tmp_path):
     save_object(made_of(DOOR.motion()), tmp_path / "object")
     with pytest.raises(ValueError, match=r"config\.json is missing"):
         evaluate_run(tmp_path)
+
+
+def boxes_of(obj, k: int, lift: float = 0.0) -> trimesh.Trimesh:
+    """The box of part k as a mesh, raised."""
+    box = obj.parts.boxes[k]
+    pose = box.T_world_box.as_matrix().numpy()
+    mesh = trimesh.creation.box(2 * box.half_extents.numpy(), pose)
+    return mesh.apply_translation([0, 0, lift])
+
+
+def truth_with_meshes(folder, obj, *joints: TrueJoint) -> Truth:
+    """True meshes that are the parts' boxes, moved by the true joints."""
+    files = {}
+    for state in (0, 1):
+        for k in range(len(joints) + 1):
+            mesh = boxes_of(obj, k)
+            if state and k:
+                mesh.apply_transform(joints[k - 1].motion().as_matrix().numpy())
+            files[state, k] = folder / f"{state}_{k}.ply"
+            mesh.export(files[state, k])
+    return Truth(joints, files)
+
+
+def test_surfaces_that_are_the_true_ones_leave_what_sampling_leaves(tmp_path):
+    """Two samples of one area A: mean squares of A / (pi P) both ways."""
+    obj = made_of(DOOR.motion(), DRAWER.motion())
+    truth = truth_with_meshes(tmp_path, obj, DOOR, DRAWER)
+    meshes = [boxes_of(obj, k) for k in range(3)]
+    for name, points in (("paris", 10_000), ("artgs", 10_000)):
+        score = score_surfaces(meshes, obj, truth, [1, 2], SURFACE_PROTOCOLS[name])
+        assert score.cd_static == pytest.approx(2000 * meshes[0].area / (math.pi * points), rel=0.1)
+        assert score.cd_movable == pytest.approx(2000 * meshes[1].area / (math.pi * points), rel=0.1)
+        assert score.accuracy is None
+
+
+def test_a_surface_in_the_wrong_place_is_measured_in_every_state(tmp_path):
+    obj = made_of(DOOR.motion())
+    truth = truth_with_meshes(tmp_path, obj, DOOR)
+    right = score_surfaces([boxes_of(obj, 0), boxes_of(obj, 1)], obj, truth, [1], SURFACE_PROTOCOLS["artgs"])
+    moved = score_surfaces([boxes_of(obj, 0), boxes_of(obj, 1, lift=2)], obj, truth, [1], SURFACE_PROTOCOLS["artgs"])
+    assert moved.cd_static == right.cd_static
+    assert moved.cd_movable > 2 * 1000 * 1.6**2
+    still = replace(obj, joints=tuple(replace(joint, q=(0.0, 0.0)) for joint in obj.joints))
+    stays = score_surfaces([boxes_of(obj, 0), boxes_of(obj, 1)], still, truth, [1], SURFACE_PROTOCOLS["artgs"])
+    assert stays.cd_movable > 10 * right.cd_movable
+    start = score_surfaces([boxes_of(obj, 0), boxes_of(obj, 1)], still, truth, [1], SURFACE_PROTOCOLS["paris"])
+    assert start.cd_movable == pytest.approx(right.cd_movable, rel=0.2)
+
+
+def test_a_part_that_was_not_found_has_no_movable_figure(tmp_path):
+    obj = made_of(DOOR.motion())
+    meshes = [boxes_of(obj, 0), boxes_of(obj, 1)]
+    truth = truth_with_meshes(tmp_path, made_of(DOOR.motion(), DRAWER.motion()), DOOR, DRAWER)
+    score = score_surfaces(meshes, obj, truth, [1, None], SURFACE_PROTOCOLS["paris"])
+    assert score.cd_movable is None
+    assert score.cd_whole > 0
+
+
+def test_without_true_meshes_there_are_no_surface_figures():
+    obj = made_of(DOOR.motion())
+    report = evaluate_object(obj, photographed(obj), Truth((DOOR,), {}), meshes=[boxes_of(obj, 0), boxes_of(obj, 1)])
+    assert report.surfaces is None
+    assert report.as_json()["cd_whole"] is None
+
+
+def test_a_report_holds_the_surfaces_figures(tmp_path):
+    obj = made_of(DOOR.motion())
+    truth = truth_with_meshes(tmp_path, obj, DOOR)
+    meshes = [boxes_of(obj, 0), boxes_of(obj, 1)]
+    record = evaluate_object(obj, photographed(obj), truth, protocol="paris", meshes=meshes).as_json()
+    assert 0 < record["cd_movable"] < record["cd_static"] < 1.2
+    assert record["completeness"] is None
+
+
+def test_what_no_camera_sees_is_not_asked_for():
+    """A camera below sees the underside of a plate and not its upper side; completeness asks for the former only."""
+    obj = made_of(DOOR.motion())
+    view = photographed(obj).train[0][0]
+    x, y = np.meshgrid(np.linspace(-1, 1, 200), np.linspace(-1, 1, 200))
+    sheets = [np.stack([x, y, np.full_like(x, z)], -1).reshape(-1, 3) for z in (-0.3, 0.3)]
+    seen = seen_points(np.concatenate(sheets), [view])
+    inside = np.abs(sheets[0][:, :2]).max(1) < 0.7
+    assert seen[: len(sheets[0])][inside].all()
+    assert not seen[len(sheets[0]) :][inside].any()

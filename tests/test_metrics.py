@@ -6,7 +6,7 @@ import torch
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from structuregs.metrics import axis_angle_deg, axis_position, geodesic_deg, psnr, translation_error
+from structuregs.metrics import axis_angle_deg, axis_position, chamfer, geodesic_deg, nearest_distances, psnr, translation_error
 
 
 def vector(*values: float) -> torch.Tensor:
@@ -85,3 +85,17 @@ def test_translation_error_sees_length_and_direction():
     assert translation_error(x, 0.3, y, 0.4) == pytest.approx(0.5)
     assert translation_error(-x, 0.3, x, 0.3) == pytest.approx(0.6)
     assert translation_error(-x, -0.3, x, 0.3) == pytest.approx(0)
+
+
+def test_chamfer_adds_squares_of_both_directions():
+    """One point at a distance .1 from a pair, which is .3 from it at its farther end: (.1^2 + (.1^2 + .3^2) / 2) x 1000."""
+    one, pair = np.array([[0.0, 0, 0]]), np.array([[0.1, 0, 0], [0, 0.3, 0]])
+    assert chamfer(one, pair) == pytest.approx(10 + (10 + 90) / 2)
+    assert chamfer(pair, one) == pytest.approx(chamfer(one, pair))
+    assert chamfer(pair, pair) == 0
+    assert nearest_distances(pair, one) == pytest.approx([0.1, 0.3])
+
+
+def test_chamfer_of_random_points_of_one_square_is_that_of_their_density():
+    a, b = np.random.default_rng(0).random((2, 10_000, 3)) * [1, 1, 0]
+    assert chamfer(a, b) == pytest.approx(2000 / (math.pi * 10_000), rel=0.05)

@@ -1,14 +1,19 @@
 """A run's figures under a protocol, and the JSON that holds them."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import trimesh
+
 from ..capture import Capture, Truth, find_truth, load_capture, load_truth
+from ..export.mesh import part_meshes
 from ..model import ArticulatedObject, load_object
 from .images import psnr_on_views
 from .scores import JointScore, score_joints
+from .surfaces import SURFACE_PROTOCOLS, SurfaceScore, score_surfaces
 
 _FEWEST_TRAINING_VIEWS = 3  # evaluation looks at the test views only; a capture is read with three others or more
 
@@ -53,6 +58,7 @@ class Report:
         psnr_by_state: the same for each state.
         psnr_object: over the object's own pixels; None unless the protocol asks for it.
         seconds: what the fit took, all sessions together; None where the run does not say.
+        surfaces: errors of the parts' surfaces; None where no meshes were given or the ground truth has none.
     """
 
     protocol: str
@@ -62,6 +68,7 @@ class Report:
     psnr_by_state: tuple[float | None, float | None]
     psnr_object: float | None
     seconds: float | None
+    surfaces: SurfaceScore | None = None
 
     @property
     def failures(self) -> int:
@@ -70,7 +77,9 @@ class Report:
 
     def as_json(self) -> dict[str, Any]:
         """The report as JSON holds it: distances in the capture's unit, angles in degrees, `null` where not applicable."""
-        return asdict(self) | {"failures": self.failures}
+        record = asdict(self)
+        surfaces = record.pop("surfaces") or dict.fromkeys(SurfaceScore.__dataclass_fields__)
+        return record | surfaces | {"failures": self.failures}
 
 
 def evaluate_run(run: Path, *, truth: Path | None = None, protocol: str = "strict") -> Report:
@@ -87,15 +96,23 @@ def evaluate_run(run: Path, *, truth: Path | None = None, protocol: str = "stric
     obj = load_object(run / "object")
     capture = load_capture(capture_of_run(run), views=_FEWEST_TRAINING_VIEWS)
     folder = truth or find_truth(capture)
-    return evaluate_object(
-        obj, capture, load_truth(folder) if folder else None, protocol=protocol, seconds=_seconds_of_run(run)
-    )
+    true, meshes = load_truth(folder) if folder else None, None
+    if true is not None and true.meshes:
+        capture = training_capture(run)
+        meshes = part_meshes(obj, capture)
+    return evaluate_object(obj, capture, true, protocol=protocol, seconds=_seconds_of_run(run), meshes=meshes)
 
 
 def evaluate_object(
-    obj: ArticulatedObject, capture: Capture, truth: Truth | None, *, protocol: str = "strict", seconds: float | None = None
+    obj: ArticulatedObject,
+    capture: Capture,
+    truth: Truth | None,
+    *,
+    protocol: str = "strict",
+    seconds: float | None = None,
+    meshes: Sequence[trimesh.Trimesh] | None = None,
 ) -> Report:
-    """The figures of an object; arguments as in `evaluate_run`.
+    """The figures of an object; arguments as in `evaluate_run`, and the surfaces of its parts (`part_meshes`).
 
     Raises:
         ValueError: no such protocol.
@@ -110,6 +127,10 @@ def evaluate_object(
     if PROTOCOLS[protocol].object_psnr:
         by_object = [psnr_on_views(splats, views, object_only=True) for splats, views in zip(states, capture.test, strict=True)]
     counts = [len(views) for views in capture.test]
+    surfaces = None
+    if truth and meshes is not None:
+        parts = [score.part for score in joints]
+        surfaces = score_surfaces(meshes, obj, truth, parts, SURFACE_PROTOCOLS[protocol], capture.train)
     return Report(
         protocol,
         joints,
@@ -118,6 +139,7 @@ def evaluate_object(
         (rows[0], rows[1]),
         _mean(by_object, counts),
         seconds,
+        surfaces,
     )
 
 
@@ -135,9 +157,25 @@ def capture_of_run(run: Path) -> Path:
     Raises:
         ValueError: the run's configuration is missing or damaged.
     """
+    return Path(_configuration(run, "capture")[0])
+
+
+def training_capture(run: Path) -> Capture:
+    """The capture that a run was fitted to, with the training views that the fit had.
+
+    Raises:
+        ValueError: the run's configuration is missing or damaged.
+    """
+    folder, views, seed = _configuration(run, "capture", "views", "seed")
+    return load_capture(Path(folder), views=max(views), seed=seed)
+
+
+def _configuration(run: Path, *names: str) -> list[Any]:
+    """Entries of a run's configuration."""
     file = run / "config.json"
     try:
-        return Path(json.loads(file.read_text())["capture"])
+        record = json.loads(file.read_text())
+        return [record[name] for name in names]
     except FileNotFoundError as error:
         raise ValueError(f"{run}: no run here (config.json is missing); run `structuregs fit` first.") from error
     except (ValueError, KeyError, TypeError) as error:

@@ -1,7 +1,8 @@
 """Draws splats: a differentiable renderer with several back ends, and the losses on its images."""
 
 from .image_loss import image_loss
+from .median import Surface, render_surface
 from .records import Projection, Render
 from .render import blend, project, render
 
-__all__ = ["Projection", "Render", "blend", "image_loss", "project", "render"]
+__all__ = ["Projection", "Render", "Surface", "blend", "image_loss", "project", "render", "render_surface"]

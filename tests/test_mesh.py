@@ -1,0 +1,158 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from structuregs.capture import Capture, View
+from structuregs.export.mesh import part_meshes, without_specks
+from structuregs.export.tsdf import Volume
+from structuregs.geometry import SE3, Box, Camera
+from structuregs.joints import articulate
+from structuregs.model import SH_C0, PosedParts, Splats
+from structuregs.raster import render, render_surface
+
+RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
+
+
+def camera_at(azimuth: float, height: float = 0.8, distance: float = 4.0, size: int = 96) -> Camera:
+    """A camera that looks at the origin, z up."""
+    position = np.array([distance * math.cos(azimuth), distance * math.sin(azimuth), height])
+    forward = -position / np.linalg.norm(position)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward], 1)
+    pose = SE3.from_rotation(torch.from_numpy(R), torch.from_numpy(position)).to(dtype=torch.float32)
+    return Camera(pose, 1.6 * size, 1.6 * size, size / 2, size / 2, size, size)
+
+
+def sheet(n: int, colour: tuple[float, float, float], flatness: float = 0.002) -> Splats:
+    """Opaque discs that tile [-1, 1]^2 in the plane z = 0 without a gap."""
+    u = (torch.arange(n) + 0.5) * 2 / n - 1
+    means = torch.stack([*torch.meshgrid(u, u, indexing="ij"), torch.zeros(n, n)], -1).reshape(-1, 3)
+    log_scales = torch.tensor([1.2 / n, 1.2 / n, flatness]).log().expand(n * n, 3)
+    sh = ((torch.tensor(colour) - 0.5) / SH_C0).expand(n * n, 1, 3)
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(n * n, 4)
+    return Splats(means, quats, log_scales.contiguous(), torch.full((n * n,), 6.0), sh.contiguous())
+
+
+def cube_splats(half: float, colour: tuple[float, float, float], n: int = 24) -> Splats:
+    """The six faces of a cube about the origin."""
+    face = sheet(n, colour)
+    face = Splats(**(face.tensors() | {"means": face.means * half, "log_scales": face.log_scales + math.log(half)}))
+    turns = [(0, 0, 0), (math.pi, 0, 0), (math.pi / 2, 0, 0), (-math.pi / 2, 0, 0), (0, math.pi / 2, 0), (0, -math.pi / 2, 0)]
+    lift = SE3.from_quat(torch.tensor([1.0, 0, 0, 0]), torch.tensor([0, 0, half]))
+    return Splats.concatenate(face.moved(SE3.exp(torch.tensor([0.0, 0, 0, *turn])) @ lift) for turn in turns)
+
+
+def two_cubes() -> tuple[PosedParts, Capture]:
+    """A red cube of half size .4, and a blue one of .2 that touches nothing and slides by .5 along y."""
+    halves, centres = (0.4, 0.2), ((-0.5, 0.0, 0.0), (0.4, -0.2, 0.0))
+    splats = [cube_splats(half, colour) for half, colour in zip(halves, (RED, BLUE), strict=True)]
+    boxes = Box(
+        SE3(torch.tensor([[1.0, 0, 0, 0, *centre] for centre in centres])),
+        torch.tensor([[half] * 3 for half in halves]),
+    )
+    motions = SE3(torch.tensor([[1.0, 0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, 0, 0.5, 0]]))
+    canonical = [Splats(**(s.tensors() | {"means": s.means / half})) for s, half in zip(splats, halves, strict=True)]
+    together = Splats.concatenate(canonical)
+    counts = (len(canonical[0]), len(canonical[1]))
+    parts = PosedParts(boxes, motions, together, counts, torch.zeros(len(together), 3))
+    rows = []
+    for state in (0, 1):
+        placed, views = parts.at_state(state), []
+        for i in range(16):
+            camera = camera_at(i * 2.4, height=-2.5 + i / 3, size=240)
+            alpha = (render(placed, camera).alpha > 0.5).byte()[..., None] * 255
+            views.append(View(f"{i:04d}", camera, torch.cat([alpha, alpha, alpha, alpha], -1).numpy()))
+        rows.append(tuple(views))
+    return parts, Capture("cubes", Path("cubes"), (rows[0], rows[1]), ((), ()), "memory")
+
+
+def test_the_median_depth_of_a_slanted_sheet_is_that_of_its_plane():
+    camera = camera_at(0.3, height=2.5, size=160)
+    surface = render_surface(sheet(20, RED, flatness=1e-4), camera)
+    origin, rays = camera.rays()
+    depth = -origin[2] / rays[..., 2]
+    hit = origin + rays * depth[..., None]
+    inside = (hit[..., :2].abs().amax(-1) < 0.9).numpy()
+    assert inside.sum() > 2000
+    assert np.abs(surface.depth - depth.numpy())[inside].max() < 0.015
+    assert np.abs(surface.rgb[inside] - RED).max() < 0.01
+
+
+def test_a_faint_veil_before_a_wall_does_not_move_the_median():
+    wall = sheet(20, RED)
+    veil = Splats(**(sheet(20, BLUE).tensors() | {"logit_opacities": torch.full((400,), -3.0)}))
+    camera = Camera(SE3.from_quat(torch.tensor([1.0, 0, 0, 0]), torch.tensor([0.0, 0, -3])), 80.0, 80.0, 16.0, 16.0, 32, 32)
+    before = SE3.from_quat(torch.tensor([1.0, 0, 0, 0]), torch.tensor([0.0, 0, -0.5]))
+    both = Splats.concatenate([wall, veil.moved(before)])
+    surface = render_surface(both, camera)
+    assert np.abs(surface.depth - 3).max() < 0.01
+    assert render(both, camera).depth.max() < 2.98
+
+
+def test_half_of_the_light_must_be_gone():
+    faint = Splats(**(sheet(4, RED).tensors() | {"logit_opacities": torch.full((16,), -3.0)}))
+    assert not render_surface(faint, camera_at(0.0)).depth.any()
+
+
+def test_fused_depth_of_a_ball_is_the_ball():
+    """Depth in closed form; the surface lies within a fraction of a voxel, with normals to the outside."""
+    radius, voxel = 0.5, 0.05
+    volume = Volume(np.full(3, -0.8), voxel, 3 * voxel, (33, 33, 33))
+    projections, depths, empties = [], [], []
+    for i in range(24):
+        camera = camera_at(i * 2.4, height=-3 + i / 4, size=160)
+        origin, rays = (t.double() for t in camera.rays())
+        a, b, c = rays.square().sum(-1), 2 * (rays * origin).sum(-1), origin.square().sum() - radius**2
+        root = b * b - 4 * a * c
+        depth = torch.where(root > 0, (-b - root.clamp(min=0).sqrt()) / (2 * a), torch.zeros_like(root))
+        pose = camera.T_world_camera.to(dtype=torch.float64).inverse()
+        projections.append((camera.K.double() @ pose.as_matrix()[:3]).numpy())
+        depths.append(depth.float().numpy())
+        empties.append(np.where(depths[-1] > 0, 0, np.inf).astype(np.float32))
+    green = np.broadcast_to(np.float32([0, 1, 0]), (*np.stack(depths).shape, 3)).copy()
+    volume.fuse(np.stack(projections), np.stack(depths), np.stack(empties), green)
+    vertices, faces, rgb = volume.surface()
+    ball = trimesh.Trimesh(vertices, faces, process=False)
+    assert np.abs(np.linalg.norm(vertices, axis=1) - radius).max() < voxel / 2
+    assert ball.volume == pytest.approx(4 / 3 * math.pi * radius**3, rel=0.05)
+    assert np.allclose(rgb, [0, 1, 0])
+
+
+def test_a_grid_that_saw_nothing_has_no_surface():
+    vertices, faces, _ = Volume(np.zeros(3), 0.1, 0.3, (5, 5, 5)).surface()
+    assert len(vertices) == len(faces) == 0
+
+
+def test_each_part_has_its_own_surface_in_state_0():
+    parts, capture = two_cubes()
+    meshes = part_meshes(articulate(parts), capture, voxel=0.02)
+    for mesh, half, centre, colour in zip(meshes, (0.4, 0.2), ((-0.5, 0, 0), (0.4, -0.2, 0)), (RED, BLUE), strict=True):
+        true = trimesh.creation.box([2 * half] * 3, trimesh.transformations.translation_matrix(centre))
+        assert np.abs(mesh.bounds - true.bounds).max() < 0.04
+        assert mesh.volume == pytest.approx(true.volume, rel=0.12)
+        inside = np.abs(np.asarray(mesh.vertices) - centre).max(1)
+        assert np.quantile(np.abs(inside - half), 0.95) < 0.025
+        rgba = np.asarray(mesh.visual.vertex_colors)
+        assert np.abs(np.median(rgba[:, :3], 0) / 255 - colour).max() < 0.05
+
+
+def test_the_same_object_gives_the_same_meshes():
+    parts, capture = two_cubes()
+    once, twice = (part_meshes(articulate(parts), capture, voxel=0.04) for _ in range(2))
+    for a, b in zip(once, twice, strict=True):
+        assert np.array_equal(a.vertices, b.vertices)
+        assert np.array_equal(a.visual.vertex_colors, b.visual.vertex_colors)
+
+
+def test_specks_go_and_handles_stay():
+    door, handle, speck = (trimesh.creation.box([size] * 3) for size in (1.0, 0.3, 0.05))
+    pieces = [door, handle.apply_translation([2, 0, 0]), speck.apply_translation([0, 2, 0])]
+    mesh = trimesh.util.concatenate(pieces)
+    assert without_specks(mesh, 0.01).area == pytest.approx(door.area + handle.area)
+    assert without_specks(mesh, 0.1).area == pytest.approx(door.area)
+    assert without_specks(mesh, 0.0).area == pytest.approx(mesh.area)
