@@ -8,6 +8,7 @@ import trimesh
 
 from structuregs.capture import Capture, View
 from structuregs.export.mesh import part_meshes, without_specks
+from structuregs.export.texture import export_meshes, textured
 from structuregs.export.tsdf import Volume
 from structuregs.geometry import SE3, Box, Camera
 from structuregs.joints import articulate
@@ -156,3 +157,41 @@ def test_specks_go_and_handles_stay():
     assert without_specks(mesh, 0.01).area == pytest.approx(door.area + handle.area)
     assert without_specks(mesh, 0.1).area == pytest.approx(door.area)
     assert without_specks(mesh, 0.0).area == pytest.approx(mesh.area)
+
+
+def coloured_ball() -> trimesh.Trimesh:
+    """A ball whose colours are its points' coordinates."""
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    rgba = np.concatenate([np.rint((ball.vertices + 1) * 127.5), np.full((len(ball.vertices), 1), 255)], 1)
+    return trimesh.Trimesh(ball.vertices, ball.faces, process=False, vertex_colors=rgba.astype(np.uint8))
+
+
+def test_a_texture_holds_the_colours_of_the_places_it_lies_on():
+    pytest.importorskip("xatlas")
+    pytest.importorskip("fast_simplification")
+    light = textured(coloured_ball(), faces=2000, size=512)
+    assert len(light.faces) <= 2000
+    corners, uv = np.asarray(light.triangles), np.asarray(light.visual.uv)[light.faces]
+    image = np.asarray(light.visual.material.image).astype(float)
+    for weights in ([0.34, 0.33, 0.33], [0.8, 0.1, 0.1], [0.1, 0.1, 0.8]):
+        place, at = np.einsum("fcd,c->fd", corners, weights), np.einsum("fcd,c->fd", uv, weights)
+        column, row = np.floor(at[:, 0] * 512).astype(int), np.floor((1 - at[:, 1]) * 512).astype(int)
+        found = image[row.clip(0, 511), column.clip(0, 511)] / 127.5 - 1
+        assert np.quantile(np.abs(found - place).max(1), 0.99) < 0.05
+
+
+def test_exported_meshes_open_as_they_are_and_are_the_same_bytes(tmp_path):
+    pytest.importorskip("xatlas")
+    pytest.importorskip("fast_simplification")
+    parts, _ = two_cubes()
+    obj, meshes = articulate(parts), [coloured_ball(), trimesh.Trimesh()]
+    files = export_meshes(obj, meshes, tmp_path / "once", faces=2000, size=128)
+    assert [file.name for file in files] == ["base.ply", "base.obj"]
+    surface, light = (trimesh.load_mesh(file, process=False) for file in files)
+    assert np.allclose(surface.vertices, meshes[0].vertices, atol=1e-6)
+    assert np.array_equal(surface.visual.vertex_colors, meshes[0].visual.vertex_colors)
+    assert light.visual.material.image.size == (128, 128)
+    assert light.volume == pytest.approx(surface.volume, rel=0.02)
+    export_meshes(obj, meshes, tmp_path / "twice", faces=2000, size=128)
+    for file in (tmp_path / "once").iterdir():
+        assert file.read_bytes() == (tmp_path / "twice" / file.name).read_bytes()
