@@ -7,8 +7,8 @@ import torch
 import trimesh
 
 from structuregs.capture import Capture, View
-from structuregs.export.mesh import part_meshes, without_specks
-from structuregs.export.texture import export_meshes, textured
+from structuregs.export.mesh import export_meshes, part_meshes, without_specks
+from structuregs.export.texture import textured
 from structuregs.export.tsdf import Volume
 from structuregs.geometry import SE3, Box, Camera
 from structuregs.joints import articulate

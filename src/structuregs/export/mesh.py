@@ -1,7 +1,8 @@
-"""A clean surface for each part, from its splats as the photos' cameras see them."""
+"""A clean surface for each part, from its splats as the photos' cameras see them; and files of it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from ..capture import Capture, ImageStack, stack_views
 from ..geometry import SE3, Box, Camera
 from ..model import ArticulatedObject, Splats
 from ..raster import render_surface
+from .assets import replace_file, write_visual
+from .texture import textured
 from .tsdf import Volume
 
 _SIZE = 400  # side of the images that depth is rendered in, pixels
@@ -136,3 +139,30 @@ def without_specks(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
     used, faces = np.unique(faces, return_inverse=True)
     colours = np.asarray(mesh.visual.vertex_colors)[used] if isinstance(mesh.visual, ColorVisuals) else None
     return trimesh.Trimesh(mesh.vertices[used], faces.reshape(-1, 3), process=False, vertex_colors=colours)
+
+
+def export_meshes(
+    obj: ArticulatedObject, meshes: Sequence[trimesh.Trimesh], folder: Path, *, faces: int = 20_000, size: int = 1024
+) -> list[Path]:
+    """Writes every part's surface twice: `base.ply`, as it is, and `base.obj` with `.mtl` and `.png`, lighter and textured.
+
+    Args:
+        obj: names the parts.
+        meshes: of its parts, in order, in the world in state 0, with vertex colours; a part without faces is left out.
+        folder: made if it is not there.
+        faces: of a textured mesh, at most.
+        size: side of a texture, pixels.
+
+    Returns:
+        The PLY and OBJ files.
+    """
+    files = []
+    for name, mesh in zip(obj.parts.names, meshes, strict=True):
+        if not len(mesh.faces):
+            continue
+        content = mesh.export(file_type="ply")
+        assert isinstance(content, bytes)
+        files.append(replace_file(folder / f"{name}.ply", content))
+        write_visual(textured(mesh, faces=faces, size=size), name, folder)
+        files.append(folder / f"{name}.obj")
+    return files

@@ -1,7 +1,6 @@
-"""Meshes with colours per vertex to lighter meshes with a texture, and files of both."""
+"""Meshes with colours per vertex to lighter meshes with a texture."""
 
-from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -13,37 +12,8 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import SimpleMaterial
 
 from ..jit import kernel
-from ..model import ArticulatedObject
-from .assets import replace_file, write_visual
 
 _NEAREST = 3  # vertices whose colours a texel mixes
-
-
-def export_meshes(
-    obj: ArticulatedObject, meshes: Sequence[trimesh.Trimesh], folder: Path, *, faces: int = 20_000, size: int = 1024
-) -> list[Path]:
-    """Writes every part's surface twice: `base.ply`, as it is, and `base.obj` with `.mtl` and `.png`, lighter and textured.
-
-    Args:
-        obj: names the parts.
-        meshes: of its parts, in order, in the world in state 0, with vertex colours; a part without faces is left out.
-        folder: made if it is not there.
-        faces: of a textured mesh, at most.
-        size: side of a texture, pixels.
-
-    Returns:
-        The PLY and OBJ files.
-    """
-    files = []
-    for name, mesh in zip(obj.parts.names, meshes, strict=True):
-        if not len(mesh.faces):
-            continue
-        content = mesh.export(file_type="ply")
-        assert isinstance(content, bytes)
-        files.append(replace_file(folder / f"{name}.ply", content))
-        write_visual(textured(mesh, faces=faces, size=size), name, folder)
-        files.append(folder / f"{name}.obj")
-    return files
 
 
 def textured(mesh: trimesh.Trimesh, *, faces: int = 20_000, size: int = 1024) -> trimesh.Trimesh:
@@ -64,7 +34,8 @@ def textured(mesh: trimesh.Trimesh, *, faces: int = 20_000, size: int = 1024) ->
         raise ValueError(f"textured meshes need {error.name}; run `pip install 'structuregs[sim]'`.") from error
     vertices, triangles = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
     if len(triangles) > faces:
-        vertices, triangles = fast_simplification.simplify(vertices, triangles, target_count=faces)
+        simplify: Any = fast_simplification.simplify
+        vertices, triangles = simplify(vertices, triangles, target_count=faces)
     atlas = xatlas.Atlas()
     atlas.add_mesh(vertices, triangles.astype(np.uint32))
     pack = xatlas.PackOptions()
