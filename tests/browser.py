@@ -17,12 +17,12 @@ CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chro
 _FLAGS = (
     *("--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    *("--disable-dev-shm-usage", "--host-resolver-rules=MAP * ~NOTFOUND", "--remote-debugging-pipe"),
+    *("--disable-dev-shm-usage", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", "--remote-debugging-pipe"),
 )
 
 
 class Browser:
-    """One page of a headless browser that reaches no network (DevTools protocol over the file descriptors 3 and 4)."""
+    """One page of a headless browser that reaches this machine only (DevTools protocol over the file descriptors 3 and 4)."""
 
     def __init__(self, profile: Path, width: int = 900, height: int = 600) -> None:
         self.requests: list[str] = []

@@ -50,16 +50,31 @@ def page_of(obj: ArticulatedObject, *, title: str) -> str:
     """
     # No string of the data may end the element that holds it.
     scene = json.dumps(scene_of(obj), separators=(",", ":")).replace("<", "\\u003c")
-    script = page_file("viewer.js") + "\n" + page_file("controls.js")
-    return filled("viewer.html", title=html.escape(title), style=page_file("viewer.css"), scene=scene, script=script)
+    return _page(title, scene, "viewer.js", "controls.js")
 
 
-def scene_of(obj: ArticulatedObject) -> dict[str, Any]:
+def live_page(*, title: str) -> str:
+    """The text of the same page without a scene: it asks for `scene` beside it, once a second (structuregs.view)."""
+    return _page(title, "null", "viewer.js", "controls.js", "live.js", allowed="; connect-src 'self'")
+
+
+def _page(title: str, scene: str, *scripts: str, allowed: str = "") -> str:
+    """The page with a scene and scripts; `allowed` adds to what its security policy lets it do."""
+    script = "\n".join(page_file(name) for name in scripts)
+    style = page_file("viewer.css")
+    return filled("viewer.html", title=html.escape(title), style=style, scene=scene, script=script, allowed=allowed)
+
+
+def scene_of(obj: ArticulatedObject, *, view: dict[str, Any] | None = None) -> dict[str, Any]:
     """What the page's script draws, ready for JSON; everything in the world as it stands in state 0.
 
     `splats` holds 16 unsigned 16-bit numbers a splat in base64, part after part; number n of column c stands for
     `low[c] + n (high[c] - low[c]) / 65535`.  The columns: mean (3), rotation as modified Rodrigues parameters (3),
     logarithm of the scales (3), rgb halfway between the states (3), opacity, tint (3).
+
+    Args:
+        obj: what is drawn.
+        view: that the page opens with; that of `first_view` if None, for which the object is rendered.
     """
     numbers, low, high = quantised(splat_columns(obj))
     return {
@@ -87,7 +102,7 @@ def scene_of(obj: ArticulatedObject) -> dict[str, Any]:
             }
             for k, joint in enumerate(obj.joints, start=1)
         ],
-        "view": _first_view(obj),
+        "view": view if view is not None else first_view(obj),
     }
 
 
@@ -124,11 +139,11 @@ def _rodrigues(splats: Splats) -> Float[Tensor, "N 3"]:
 
 def opening_camera(obj: ArticulatedObject, size: int) -> Camera:
     """The camera of a square picture that shows the whole object in both states, from where the page opens."""
-    view = _first_view(obj)
+    view = first_view(obj)
     return _orbiting(torch.tensor(view["target"]), view["radius"], view["azimuth"], size)
 
 
-def _first_view(obj: ArticulatedObject) -> dict[str, Any]:
+def first_view(obj: ArticulatedObject) -> dict[str, Any]:
     """Where the page's camera orbits, and the direction it starts in."""
     states = [obj.boxes_at([joint.q[s] for joint in obj.joints]) for s in (0, 1)]
     corners = torch.cat([boxes.corners.reshape(-1, 3) for boxes in states])

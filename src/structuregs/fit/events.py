@@ -1,5 +1,6 @@
 """What a fit reports while it runs; the command line, a viewer and the tests consume the same stream."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,6 +47,17 @@ class Note:
 
 
 @dataclass(frozen=True)
+class Preview:
+    """The object can be looked at as it stands now.
+
+    Attributes:
+        obj: makes a copy of it that no later step changes; to be called before the next event is taken.
+    """
+
+    obj: Callable[[], ArticulatedObject]
+
+
+@dataclass(frozen=True)
 class Finished:
     """The fit is done.
 
@@ -58,4 +70,4 @@ class Finished:
     run: Path | None
 
 
-FitEvent = StageStarted | Step | Note | Finished
+FitEvent = StageStarted | Step | Note | Preview | Finished

@@ -4,7 +4,9 @@ import json
 import tempfile
 import time
 from collections.abc import Generator, Iterator
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -14,9 +16,11 @@ from ..capture import Capture
 from ..geometry import SE3, Box
 from ..joints import articulate, joints_of
 from ..model import ArticulatedObject, PosedParts, load_object, save_object
-from .events import Finished, FitEvent, Note, StageStarted, Step
+from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
 from .loop import FitState, Fitter
 from .schedule import PRESETS, FitConfig
+
+_PREVIEW_EVERY = 50  # steps
 
 
 @dataclass(frozen=True)
@@ -188,6 +192,12 @@ def finished_object(state: FitState) -> ArticulatedObject:
     return replace(obj, joints=tuple(joints))
 
 
+def unfinished_object(state: FitState) -> ArticulatedObject:
+    """The object of a fit as it stands: a copy on the CPU, which no later step changes."""
+    obj = finished_object(state)
+    return replace(obj, parts=deepcopy(obj.parts.to(torch.device("cpu"))))
+
+
 def fit_run(
     capture: Capture,
     run: Path,
@@ -239,12 +249,15 @@ def fit_run(
         clock.save()
     yield StageStarted("fit", config.steps)
     fitter = Fitter(capture, config, state, seed, chosen)
+    yield Preview(partial(unfinished_object, state))
     while fitter.state.step < config.steps:
         done = fitter.state.step
         for event in fitter.run(done - done % config.checkpoint_every + config.checkpoint_every):
             if isinstance(event, Step):
                 _append(folder.metrics, event)
             yield event
+            if isinstance(event, Step) and event.step % _PREVIEW_EVERY == 0:
+                yield Preview(partial(unfinished_object, fitter.state))
         fitter.state.save(folder.checkpoint)
         clock.save()
     obj = finished_object(fitter.state)

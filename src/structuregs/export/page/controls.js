@@ -146,35 +146,63 @@ class Page {
     });
     this.buttons[2].addEventListener("click", () => this.play(!this.playing));
     states.append(...this.buttons);
-    this.sliders = scene.joints.map((joint, i) => this.slider(joint, i));
+    this.sliders = scene.joints.map((_, i) => this.slider(i));
     if (scene.joints.length) panel.append(states, ...this.sliders.map(({ row }) => row));
     const parts = scene.parts.map(({ name, colour }, k) =>
       this.checkBox(name.replace("_", " "), colour, (on) => (this.viewer.shown.parts[k] = on), true));
     const extras = [["boxes", "boxes"], ["joint axes", "axes"]].map(([text, key]) =>
-      this.checkBox(text, null, (on) => (this.viewer.shown[key] = on), false));
+      this.checkBox(text, null, (on) => (this.viewer.shown[key] = on), this.viewer.shown[key]));
     panel.append(element("fieldset", {}, element("legend", { textContent: "Show" }), ...parts, ...extras));
     this.mark();
   }
 
-  slider(joint, i) {
+  /** Takes another scene: each joint at the same share of its way, shown as before, the camera where it is. */
+  take(scene) {
+    const { scene: before, q, shown } = this.viewer;
+    const shares = q.map((value, i) => value / (before.joints[i].q[1] || 1));
+    const alike = scene.parts.length === before.parts.length;
+    this.viewer.load(scene);
+    Object.assign(this.viewer.shown, alike ? shown : { boxes: shown.boxes, axes: shown.axes });
+    if (alike) {
+      scene.joints.forEach((joint, i) => {
+        this.sliders[i].describe(joint);
+        this.setJoint(i, shares[i] * joint.q[1]);
+      });
+    } else {
+      const panel = document.getElementById("panel");
+      panel.replaceChildren();
+      this.fill(panel, scene);
+    }
+    this.refresh();
+  }
+
+  slider(i) {
     const part = this.viewer.scene.parts[i + 1];
     const colour = `rgb(${part.colour.join(",")})`;
-    const value = element("output", { textContent: amount(joint, 0) });
-    const [name, kind] = [part.name.replace("_", " "), joint.kind === "revolute" ? "turns" : "slides"];
-    const input = element("input", { type: "range", min: 0, max: joint.q[1], step: "any", value: 0, id: `joint_${i + 1}` });
+    const name = part.name.replace("_", " ");
+    const [value, least, most] = [element("output"), element("span"), element("span")];
+    const kind = element("span", { className: "kind" });
+    const review = element("p", { className: "review" });
+    const input = element("input", { type: "range", min: 0, step: "any", id: `joint_${i + 1}` });
     input.style.accentColor = colour;
-    input.setAttribute("aria-label", `${name} ${kind}`);
     input.addEventListener("input", () => {
       this.play(false);
       this.setJoint(i, Number(input.value));
     });
-    const head = element("div", { className: "name" }, dot(part.colour), element("b", { textContent: name }),
-      element("span", { className: "kind", textContent: kind }), value);
-    const range = element("div", { className: "range" }, element("span", { textContent: amount(joint, 0) }),
-      element("span", { textContent: amount(joint, joint.q[1]) }));
-    const row = element("div", { className: "joint" }, head, input, range);
-    if (joint.review) row.append(element("p", { className: "review", textContent: joint.review }));
-    return { row, input, value };
+    const head = element("div", { className: "name" }, dot(part.colour), element("b", { textContent: name }), kind, value);
+    const row = element("div", { className: "joint" }, head, input, element("div", { className: "range" }, least, most), review);
+    const describe = (joint) => {
+      kind.textContent = joint.kind === "revolute" ? "turns" : "slides";
+      input.setAttribute("aria-label", `${name} ${kind.textContent}`);
+      input.max = joint.q[1];
+      input.value = this.viewer.q[i];
+      value.textContent = amount(joint, this.viewer.q[i]);
+      [least.textContent, most.textContent] = joint.q.map((q) => amount(joint, q));
+      review.textContent = joint.review;
+      review.hidden = !joint.review;
+    };
+    describe(this.viewer.scene.joints[i]);
+    return { row, input, value, describe };
   }
 
   checkBox(text, colour, set, checked) {
@@ -226,7 +254,7 @@ class Page {
       if (!this.playing) return;
       this.phase += last === null ? 0 : (2 * Math.PI * (now - last)) / 1000 / LOOP_SECONDS;
       last = now;
-      this.setJoints(joints.map((joint) => ((1 - Math.cos(this.phase)) / 2) * joint.q[1]));
+      this.setJoints(this.viewer.scene.joints.map((joint) => ((1 - Math.cos(this.phase)) / 2) * joint.q[1]));
       requestAnimationFrame(frame);
     };
     requestAnimationFrame(frame);
@@ -293,9 +321,15 @@ function dot(colour) {
   return made;
 }
 
-try {
-  window.viewer = new Page(JSON.parse(document.getElementById("scene").textContent));
-  window.viewer.refresh();
-} catch (error) {
-  document.body.append(element("p", { className: "sorry", textContent: error.message }));
+/** Shows the page's first scene. */
+function begin(scene) {
+  try {
+    window.viewer = new Page(scene);
+    window.viewer.refresh();
+  } catch (error) {
+    document.body.append(element("p", { className: "sorry", textContent: error.message }));
+  }
 }
+
+const given = JSON.parse(document.getElementById("scene").textContent);
+if (given) begin(given); // a live page is given none
