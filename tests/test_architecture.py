@@ -27,10 +27,11 @@ LEVELS = {
     "fit": 4,
     "export": 5,
     "evaluate": 6,
+    "view": 6,
 }
 DOORS = {"__init__", "cli"}
 # The one room that may import a heavy package.
-ONLY_IN = {"gsplat": "raster", "viser": "view"}
+ONLY_IN = {"gsplat": "raster"}
 
 
 def room_of(file: Path) -> str:

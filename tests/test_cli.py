@@ -29,7 +29,8 @@ def run(tmp_path_factory) -> Path:
     save_truth(folder / "capture", "artgs", (DOOR, DRAWER), {})
     save_capture(photographed(obj, views=3), folder / "capture", "artgs")
     save_object(obj, folder / "object")
-    (folder / "config.json").write_text(json.dumps({"capture": str(folder / "capture")}))
+    config = {"capture": str(folder / "capture"), "views": [3, 3], "seed": 0}
+    (folder / "config.json").write_text(json.dumps(config))
     (folder / "timing.json").write_text('{"total": 12.5}')
     return folder
 
@@ -74,6 +75,7 @@ def test_render_writes_the_picture_in_the_size_asked_for(run, tmp_path, monkeypa
     [
         (("eval", "nowhere"), "run `structuregs fit` first"),
         (("render", "nowhere", "-o", "a.gif"), "run `structuregs fit` first"),
+        (("export", "nowhere"), "run `structuregs fit` first"),
         (("fit", "nowhere", "-o", "run"), "give the folder of one capture"),
     ],
 )
@@ -84,6 +86,44 @@ def test_a_users_error_is_one_sentence_and_exit_2(words, sentence, tmp_path, mon
     assert captured.err.count("\n") == 1
     assert sentence in captured.err
     assert captured.out == ""
+
+
+def test_export_writes_a_folder_for_each_format(run, tmp_path, monkeypatch, capsys):
+    assert called(monkeypatch, "export", run, "--to", "html,ply", "-o", tmp_path / "out") == 0
+    written = sorted(str(file.relative_to(tmp_path / "out")) for file in (tmp_path / "out").rglob("*.*"))
+    parts = [f"ply/{name}.ply" for name in ("base", "part_1", "part_2", "state_0", "state_1")]
+    assert written == ["html/object.html", *parts]
+    assert capsys.readouterr().out.count("wrote ") == len(written)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--to", "obj"), "give one or more of mesh,urdf,mjcf,usd,ply,glb,html"),
+        (("--to", ""), "give one or more of"),
+        (("--to", "ply", "--scale", "0"), "must be above 0"),
+        (("--to", "ply", "--limit-margin", "-1"), "give 0 or more"),
+    ],
+)
+def test_an_export_that_cannot_be_is_a_sentence_and_writes_nothing(words, sentence, run, tmp_path, monkeypatch, capsys):
+    assert called(monkeypatch, "export", run, "-o", tmp_path / "out", *words) == 2
+    assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_extra_is_named(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("structuregs.export.files.find_spec", lambda name: None if name == "pxr" else object())
+    assert called(monkeypatch, "export", run, "--to", "ply,usd", "-o", tmp_path / "out") == 2
+    assert 'pip install "structuregs[usd]"' in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_a_sentence(run, tmp_path, monkeypatch, capsys):
+    (tmp_path / "out").write_text("a file")
+    assert called(monkeypatch, "export", run, "--to", "ply", "-o", tmp_path / "out") == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert str(tmp_path / "out") in captured.err.replace("\n", "")
 
 
 def test_a_view_that_is_not_there_is_a_sentence(run, monkeypatch, capsys):

@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
@@ -13,9 +14,13 @@ import pytest
 import torch
 
 from browser import CHROMIUM, Browser
-from door_and_drawer import made_of
+from door_and_drawer import made_of, photographed
 from structuregs.export.html import page_of, scene_of
 from structuregs.export.sweep import telling_order
+from structuregs.fit.events import Preview
+from structuregs.fit.loop import FitState
+from structuregs.fit.reconstruct import fit_run
+from structuregs.fit.schedule import FitConfig, Growth
 from structuregs.geometry import Screw
 from structuregs.model import ArticulatedObject
 from structuregs.view import LivePage, serve
@@ -147,6 +152,32 @@ def test_serving_ends_with_ctrl_c(obj):
 
     serve(obj, title="thing", ready=ready)
     assert seen == [200]
+
+
+def fitted(run: Path, page: LivePage | None = None) -> list[tuple[ArticulatedObject, str]]:
+    """Goes on with a fit from rough parts to its end; what it previews, where there is a page, and its scene at that time."""
+    capture = photographed(made_of(DOOR.motion(0.8), DRAWER), views=3)
+    growth = Growth(interval=30, most=600)
+    config = FitConfig(steps=110, structure_until=10, image_from=10, sizes=((0.0, 32),), checkpoint_every=60, growth=growth)
+    next(fit_run(capture, run, config, device="cpu"))
+    FitState.start(made_of(DOOR.motion(0.5), DRAWER).parts).save(run / "checkpoints" / "last.pt")
+    seen = []
+    for event in fit_run(capture, run, config, device="cpu"):
+        if page is not None and isinstance(event, Preview):
+            obj = event.obj()
+            page.show(obj)
+            seen.append((obj, get(page.url + "scene")[1]))
+    return seen
+
+
+def test_a_fit_that_is_watched_ends_in_the_same_bytes_and_what_was_seen_stays_as_it_was(page, tmp_path):
+    seen = fitted(tmp_path / "watched", page)
+    fitted(tmp_path / "alone")
+    for name in ("object/object.json", "object/splats.safetensors", "metrics.jsonl"):
+        assert (tmp_path / "watched" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+    scenes = [json.loads(text)["splats"] for _, text in seen]
+    assert len(set(scenes)) == 3
+    assert [scene_of(obj)["splats"] for obj, _ in seen] == scenes
 
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")

@@ -7,7 +7,21 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .capture import Capture, CaptureError, View, load_capture
     from .evaluate import Report, evaluate_object, evaluate_run
-    from .export import draw_structure, render_sweep, write_sweep
+    from .export import (
+        draw_structure,
+        export_files,
+        export_glb,
+        export_html,
+        export_meshes,
+        export_mjcf,
+        export_ply,
+        export_urdf,
+        export_usd,
+        part_meshes,
+        render_sweep,
+        write_report,
+        write_sweep,
+    )
     from .fit.reconstruct import reconstruct
     from .geometry import SE3, Box, Camera, Screw
     from .joints import articulate, joints_of
@@ -31,13 +45,23 @@ __all__ = [
     "draw_structure",
     "evaluate_object",
     "evaluate_run",
+    "export_files",
+    "export_glb",
+    "export_html",
+    "export_meshes",
+    "export_mjcf",
+    "export_ply",
+    "export_urdf",
+    "export_usd",
     "joints_of",
     "load_capture",
     "load_object",
+    "part_meshes",
     "reconstruct",
     "render",
     "render_sweep",
     "save_object",
+    "write_report",
     "write_sweep",
 ]
 
@@ -49,7 +73,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 _ROOMS = {
     "capture": ("Capture", "CaptureError", "View", "load_capture"),
     "evaluate": ("Report", "evaluate_object", "evaluate_run"),
-    "export": ("draw_structure", "render_sweep", "write_sweep"),
+    "export": (
+        "draw_structure",
+        "export_files",
+        "export_glb",
+        "export_html",
+        "export_meshes",
+        "export_mjcf",
+        "export_ply",
+        "export_urdf",
+        "export_usd",
+        "part_meshes",
+        "render_sweep",
+        "write_report",
+        "write_sweep",
+    ),
     "fit.reconstruct": ("reconstruct",),
     "geometry": ("SE3", "Box", "Camera", "Screw"),
     "joints": ("articulate", "joints_of"),

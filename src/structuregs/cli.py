@@ -1,4 +1,4 @@
-"""The command line: `structuregs fit | eval | render | demo`."""
+"""The command line: `structuregs fit | eval | render | export | demo`."""
 
 import math
 import os
@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from .capture import TrueJoint
-    from .evaluate import JointScore, Report
+    from .evaluate import JointScore, Report, SurfaceScore
     from .fit.events import Finished, FitEvent, Step
     from .model import ArticulatedObject
 
@@ -76,7 +78,7 @@ def render(run: RunFolder, output: Picture, size: int = 480, frames: int = 48, v
 
     Args:
         run: Folder of the run.
-        output: .webp or .gif: an animation. .png: state 0, half way and state 1. A folder: a PNG for each frame.
+        output: .webp, .gif or .mp4: an animation. .png: state 0, half way and state 1. A folder: a PNG for each frame.
         size: Longer side of the pictures, pixels.
         frames: Frames of the whole way.
         view: Name of a view of state 1 to look from. Default: the one that shows most of the motion.
@@ -100,19 +102,51 @@ def render(run: RunFolder, output: Picture, size: int = 480, frames: int = 48, v
     print(f"wrote {output}" + (f" ({len(files)} pictures)" if len(files) > 1 else ""))
 
 
+def export(
+    run: RunFolder,
+    to: str = "mesh,urdf,mjcf,usd,ply,glb,html",
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = None,
+    scale: float = 1.0,
+    limit_margin: float = 0.0,
+) -> None:
+    """Write the files that simulators, viewers and browsers open: a folder for each format.
+
+    Args:
+        run: Folder of a finished run.
+        to: Formats, with commas between. mesh: OBJ and PLY. urdf, mjcf, usd: simulators. ply, glb: splats. html: a page.
+        output: Where the folders go. Default: `export` in the run.
+        scale: Metres per unit of the capture, for simulators and GLB.
+        limit_margin: How far joints may go beyond the observed range, radians or metres.
+    """
+    from .evaluate import training_capture
+    from .export import checked_formats, export_files, steps_of
+    from .model import load_object
+
+    formats = checked_formats([name.strip() for name in to.split(",") if name.strip()])
+    obj, folder = load_object(run / "object"), output or run / "export"
+    done = export_files(obj, training_capture(run), folder, formats, scale=scale, limit_margin=limit_margin)
+    with _bars() as progress:
+        steps = steps_of(formats)
+        task = progress.add_task("export", total=len(steps), figures=steps[0])
+        for step, coming in zip(done, [*steps[1:], ""], strict=True):
+            for file in step.files:
+                progress.console.print(f"wrote {file}", soft_wrap=True)
+            progress.update(task, advance=1, figures=coming)
+
+
 def demo(run: NewRun = Path("runs/demo")) -> None:
     """Make a small capture of a known object on the spot, reconstruct it, and print its joints beside the truth.
 
     Args:
         run: Folder of the run; the capture is made in its `capture` folder.
     """
-    from .capture import load_truth
-    from .evaluate import evaluate_run
+    from .capture import load_capture, load_truth
+    from .evaluate import evaluate_object
 
     capture = run / "capture"
-    truth = _make_known(capture)
+    truth = load_truth(_make_known(capture))
     obj = _fit(capture, run, preset="fast")
-    _print_truth(obj, load_truth(truth).joints, evaluate_run(run, truth=truth))
+    _print_truth(obj, truth.joints, evaluate_object(obj, load_capture(capture), truth))
 
 
 def _make_known(capture: Path) -> Path:
@@ -142,7 +176,7 @@ def _fit(
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> "ArticulatedObject":
     from .capture import load_capture
-    from .export import write_structure
+    from .export import write_report, write_structure
     from .fit.reconstruct import fit_run
     from .fit.schedule import PRESETS
 
@@ -150,19 +184,17 @@ def _fit(
     events = fit_run(photos, run, PRESETS[preset], device=device, parts=parts, points=points, seed=seed)
     obj = _follow(events).obj
     write_structure(photos, obj, run / "overview.png")
+    report = write_report(run, photos, obj)
     _print_joints(obj)
-    print(f"wrote {run}; look at {run / 'overview.png'}")
+    print(f"wrote {run}; look at {report}")
     return obj
 
 
 def _follow(events: "Iterable[FitEvent]") -> "Finished":
     """Shows a fit's events as progress bars and lines until it is finished."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     from .fit.events import Finished, Note, StageStarted, Step
 
-    columns = ("{task.description:12}", BarColumn(), MofNCompleteColumn(), "{task.fields[figures]}", TimeRemainingColumn())
-    with Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns)) as progress:
+    with _bars() as progress:
         task = None
         for event in events:
             match event:
@@ -175,6 +207,14 @@ def _follow(events: "Iterable[FitEvent]") -> "Finished":
                 case Finished():
                     return event
     raise RuntimeError("the fit ended without a result; run the same command to go on.")
+
+
+def _bars() -> "Progress":
+    """Progress bars with what is under way and the time left."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = ("{task.description:12}", BarColumn(), MofNCompleteColumn(), "{task.fields[figures]}", TimeRemainingColumn())
+    return Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns))
 
 
 def _figures(step: "Step") -> str:
@@ -216,8 +256,20 @@ def _print_report(report: "Report") -> None:
         states = ", ".join("-" if p is None else f"{p:.2f}" for p in report.psnr_by_state)
         inside = "" if report.psnr_object is None else f"; object's own pixels {report.psnr_object:.2f}"
         print(f"PSNR of held-out views {report.psnr:.2f} dB (states 0, 1: {states}{inside})")
+    if report.surfaces is not None:
+        _print_surfaces(report.surfaces)
     if report.seconds is not None:
         print(f"fitted in {report.seconds:.0f} s")
+
+
+def _print_surfaces(score: "SurfaceScore") -> None:
+    distances = (score.cd_static, score.cd_movable, score.cd_whole)
+    shown = (
+        f"{what} {'F' if d is None else f'{d:.3f}'}" for what, d in zip(("static", "movable", "whole"), distances, strict=True)
+    )
+    print(f"Chamfer distances of surfaces x1000: {', '.join(shown)}")
+    if score.accuracy is not None and score.completeness is not None:
+        print(f"whole surface: accuracy {score.accuracy:.4f}, completeness {score.completeness:.4f} units")
 
 
 def _score_row(score: "JointScore", unit: float) -> tuple[str, ...]:
@@ -261,7 +313,7 @@ def main() -> None:
     """Runs the command line; a user's error is one sentence and exit code 2 (`STRUCTUREGS_DEBUG=1` shows the traceback)."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"fit": fit, "eval": evaluate, "render": render, "demo": demo},
+            {"fit": fit, "eval": evaluate, "render": render, "export": export, "demo": demo},
             prog="structuregs",
             description="Photos of an articulated object in two states go in; a working digital twin comes out.",
         )
