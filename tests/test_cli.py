@@ -1,4 +1,5 @@
 import json
+import socket
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,7 @@ def test_render_writes_the_picture_in_the_size_asked_for(run, tmp_path, monkeypa
         (("eval", "nowhere"), "run `structuregs fit` first"),
         (("render", "nowhere", "-o", "a.gif"), "run `structuregs fit` first"),
         (("export", "nowhere"), "run `structuregs fit` first"),
+        (("view", "nowhere"), "run `structuregs fit` first"),
         (("fit", "nowhere", "-o", "run"), "give the folder of one capture"),
     ],
 )
@@ -124,6 +126,12 @@ def test_a_folder_that_cannot_be_written_is_a_sentence(run, tmp_path, monkeypatc
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1
     assert str(tmp_path / "out") in captured.err.replace("\n", "")
+
+
+def test_a_port_that_is_taken_is_a_sentence(run, monkeypatch, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert called(monkeypatch, "view", run, "--port", str(taken.getsockname()[1])) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_a_view_that_is_not_there_is_a_sentence(run, monkeypatch, capsys):

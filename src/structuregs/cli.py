@@ -1,9 +1,10 @@
-"""The command line: `structuregs fit | eval | render | export | demo`."""
+"""The command line: `structuregs fit | eval | render | export | view | demo`."""
 
 import math
 import os
 import sys
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from .evaluate import JointScore, Report, SurfaceScore
     from .fit.events import Finished, FitEvent, Step
     from .model import ArticulatedObject
+    from .view import LivePage
 
 # Packages that cost a second or more to import are imported in the commands: `--help` must not wait for them.
 
@@ -35,6 +37,7 @@ def fit(
     seed: int = 0,
     points: str = "hull",
     device: Literal["auto", "cpu", "cuda"] = "auto",
+    view: bool = False,
 ) -> None:
     """Reconstruct the object of a capture; on an existing run, go on from its last checkpoint.
 
@@ -47,8 +50,9 @@ def fit(
         seed: The same seed gives the same bytes on a CPU.
         points: Where the first points come from: hull (masks), depth (the capture's depth maps), or a file.
         device: Where to compute.
+        view: Show the object in the browser while it is fitted.
     """
-    _fit(capture, run, preset=preset, views=views, parts=parts, seed=seed, points=points, device=device)
+    _fit(capture, run, preset=preset, views=views, parts=parts, seed=seed, points=points, device=device, view=view)
 
 
 def evaluate(
@@ -134,6 +138,20 @@ def export(
             progress.update(task, advance=1, figures=coming)
 
 
+def view(run: RunFolder, port: int = 0) -> None:
+    """Show the object of a run in the browser, with a slider for each joint, until Ctrl-C.
+
+    Args:
+        run: Folder of a finished run.
+        port: Where the page is served, to this machine only. Default: any free port.
+    """
+    from .model import load_object
+    from .view import serve
+
+    obj = load_object(run / "object")
+    serve(obj, title=run.resolve().name, port=port, ready=lambda url: print(f"look at {url} (Ctrl-C ends)", flush=True))
+
+
 def demo(run: NewRun = Path("runs/demo")) -> None:
     """Make a small capture of a known object on the spot, reconstruct it, and print its joints beside the truth.
 
@@ -174,6 +192,7 @@ def _fit(
     seed: int = 0,
     points: str = "hull",
     device: Literal["auto", "cpu", "cuda"] = "auto",
+    view: bool = False,
 ) -> "ArticulatedObject":
     from .capture import load_capture
     from .export import write_report, write_structure
@@ -182,17 +201,24 @@ def _fit(
 
     photos = load_capture(capture, views=views, seed=seed)
     events = fit_run(photos, run, PRESETS[preset], device=device, parts=parts, points=points, seed=seed)
-    obj = _follow(events).obj
-    write_structure(photos, obj, run / "overview.png")
-    report = write_report(run, photos, obj)
+    with ExitStack() as stack:
+        page = None
+        if view:
+            from .view import LivePage
+
+            page = stack.enter_context(LivePage(photos.name))
+            print(f"look at {page.url}", flush=True)
+        obj = _follow(events, page).obj
+        write_structure(photos, obj, run / "overview.png")
+        report = write_report(run, photos, obj)
     _print_joints(obj)
     print(f"wrote {run}; look at {report}")
     return obj
 
 
-def _follow(events: "Iterable[FitEvent]") -> "Finished":
-    """Shows a fit's events as progress bars and lines until it is finished."""
-    from .fit.events import Finished, Note, StageStarted, Step
+def _follow(events: "Iterable[FitEvent]", page: "LivePage | None" = None) -> "Finished":
+    """Shows a fit's events as progress bars and lines, and its object on a page, until it is finished."""
+    from .fit.events import Finished, Note, Preview, StageStarted, Step
 
     with _bars() as progress:
         task = None
@@ -204,7 +230,11 @@ def _follow(events: "Iterable[FitEvent]") -> "Finished":
                     progress.update(task, completed=step, figures=_figures(event))
                 case Note(text):
                     progress.console.print(text)
-                case Finished():
+                case Preview(make) if page is not None:
+                    page.show(make())
+                case Finished(obj):
+                    if page is not None:
+                        page.show(obj)
                     return event
     raise RuntimeError("the fit ended without a result; run the same command to go on.")
 
@@ -313,7 +343,7 @@ def main() -> None:
     """Runs the command line; a user's error is one sentence and exit code 2 (`STRUCTUREGS_DEBUG=1` shows the traceback)."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"fit": fit, "eval": evaluate, "render": render, "export": export, "demo": demo},
+            {"fit": fit, "eval": evaluate, "render": render, "view": view, "export": export, "demo": demo},
             prog="structuregs",
             description="Photos of an articulated object in two states go in; a working digital twin comes out.",
         )
