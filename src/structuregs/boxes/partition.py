@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from jaxtyping import Float64
+from scipy.spatial import KDTree
 
 from ..geometry import SE3, Box
 from ..model import Splats
@@ -157,11 +158,16 @@ class PartSearch:
             by_cost = sorted(again, key=lambda h: h.cost(part.weight))
             gaps = displacements(SE3(torch.stack([T.wxyz_xyz for T in shared])), by_cost[0].motion, box)
             losses = np.array([h.image_error for h in again[-len(shared) :]]) - min(h.image_error for h in again)
-            losses = np.where(gaps < self.config.same, losses, np.inf)
+            alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
+            # A piece that touches a weightier part, and has no better motion of its own than that part's, belongs to it.
+            as_they_move = np.array([scene.error(piece, T) for T in shared])
+            needless = as_they_move < min(h.cost(part.weight) for h in again[: -len(shared)])
+            alike |= needless & np.array([other.weight > part.weight and self._touch(part, other) for other in others])
 
-            twin = int(np.argmin(losses))
-            if losses[twin] < self.config.alike * part.weight:
-                parts = self._merged(others[twin], part, [p for p in others if p is not others[twin]])
+            twin = int(np.argmin(np.where(alike, as_they_move, np.inf)))
+            if alike[twin]:
+                follower, leader = sorted((part, others[twin]), key=lambda p: p.weight)
+                parts = self._merged(leader, follower, [p for p in others if p is not others[twin]])
                 index = 0
                 continue
             again = by_cost
@@ -169,6 +175,11 @@ class PartSearch:
             parts[index] = replace(part, hypothesis=again[0], rivals=tuple(again[c] for c in chosen[1:]))
             index += 1
         return parts
+
+    def _touch(self, part: MovingPart, other: MovingPart) -> bool:
+        """Whether two parts lie within the reach of the clustering where the one was found."""
+        nearest = KDTree(other.points_in(part.state)).query(part.points)[0].min()
+        return bool(nearest < self.config.cue.link * self.voxel)
 
     def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those that lie within a larger one: what was left over before that one was whole."""
