@@ -113,9 +113,10 @@ def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, base:
             candidates.insert(0, (replace(screw, axis=axes[nearest]), q * float(along[nearest])))
     enough = hypothesis.image_error + 0.05 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent
     for screw, q in candidates:
-        if scene.error(part, screw.motion(q)) < enough:
-            simple = screw.motion(q)
-            return scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
+        simple = screw.motion(q)
+        judged = scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
+        if judged.image_error < enough:
+            return judged
     return hypothesis
 
 
@@ -130,10 +131,12 @@ def measured(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box) -> Hy
     """
     screw, q = screw_at(hypothesis.motion, kind_of(hypothesis.motion), box.T_world_box.xyz)
 
-    def error(at: float) -> float:
-        return scene.error(part, screw.motion(float(at)))
-
-    found = minimize_scalar(error, bounds=(0.9 * q, 1.1 * q), method="bounded", options={"maxiter": 12})
+    found = minimize_scalar(
+        lambda at: scene.error(part, screw.motion(float(at))),
+        bounds=(0.9 * q, 1.1 * q),
+        method="bounded",
+        options={"maxiter": 12},
+    )
     q = float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
     again = scene.judge(replace(hypothesis, motion=screw.motion(q)), part)
     return min(hypothesis, again, key=lambda h: h.image_error)

@@ -275,7 +275,7 @@ class PartSearch:
                 motion = motions[int(m)]
                 start = Hypothesis(motion, float(outside[m]), float(unexplained[m]), oddity(motion, box))
                 judged.append((scene.judge(start, self._piece({index, *group}), quick=True), group))
-        weight = self._weight({index})
+        weight = self._weight(index)
         refined = []
         for start, group in self._finalists(judged, box, weight):
             piece = self._piece({index, *group})
@@ -319,11 +319,11 @@ class PartSearch:
         splats = self.looks[self.clusters[min(members)].state].splats
         return splats[self._inside(splats, [self.boxes[i] for i in sorted(members)])]
 
-    def _weight(self, members: set[int]) -> float:
-        """What the photos of their own state lose without these clusters."""
-        state = self.clusters[min(members)].state
+    def _weight(self, index: int) -> float:
+        """What the photos of its own state lose without a cluster."""
+        state = self.clusters[index].state
         splats = self.looks[state].splats
-        inside = self._inside(splats, [self.boxes[i] for i in sorted(members)])
+        inside = self._inside(splats, [self.boxes[index]])
         scene, piece = Scene(self.looks[state], splats[~inside], self._judges(state)), splats[inside]
         return max(scene.absent(piece) - scene.error(piece, SE3.identity(dtype=torch.float64)), 0.0)
 

@@ -30,6 +30,7 @@ FORMATS: dict[str, dict[str, str]] = {
 }
 _OF_MESHES = {"mesh", "urdf", "mjcf", "usd", "glb"}
 _OF_LINKS = {"urdf", "mjcf", "usd"}
+_OF_TEXTURES = _OF_LINKS | {"mesh"}
 
 
 @dataclass(frozen=True)
@@ -102,24 +103,24 @@ def export_files(
     folder.mkdir(parents=True, exist_ok=True)
     chosen = set(formats)
     meshes = part_meshes(obj, capture) if chosen & _OF_MESHES else []
+    light = [textured(mesh) if len(mesh.faces) else mesh for mesh in meshes] if chosen & _OF_TEXTURES else []
     if meshes:
         yield Exported("surfaces")
     mechanism = None
     if chosen & _OF_LINKS:
-        mechanism = mechanism_of(obj, [textured(mesh) for mesh in meshes], scale=scale, limit_margin=limit_margin)
+        mechanism = mechanism_of(obj, light, scale=scale, limit_margin=limit_margin)
         yield Exported("collision pieces")
     for kind in formats:
         target = folder / kind
         if mechanism is not None and kind in _OF_LINKS:
             yield Exported(kind, (_simulated(obj, mechanism, target, kind, name, scale),))
         elif kind == "mesh":
-            yield Exported(kind, tuple(export_meshes(obj, meshes, target)))
+            yield Exported(kind, tuple(export_meshes(obj, meshes, target, light=light)))
         elif kind == "ply":
             yield Exported(kind, tuple(export_ply(obj, target)))
         elif kind == "glb":
             yield Exported(kind, tuple(export_glb(obj, meshes, target, scale=scale)))
         else:
-            target.mkdir(exist_ok=True)
             yield Exported(kind, (export_html(obj, target / f"{name}.html", title=name),))
 
 

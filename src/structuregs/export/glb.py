@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt16
 from trimesh.visual import ColorVisuals, TextureVisuals
 
 from ..model import ArticulatedObject, Splats
+from .assets import replace_file
 from .sweep import sweep_values
 
 _FRAMES = 48  # keys of the way there and back
@@ -51,7 +52,6 @@ def export_glb(
     """
     if len(meshes) != len(obj.parts):
         raise ValueError(f"export_glb: {len(meshes)} meshes for an object of {len(obj.parts)} parts; give one for each part.")
-    folder.mkdir(parents=True, exist_ok=True)
     origins = _origins(obj)
     placed = obj.parts.place(obj.parts.boxes, 0.0)
     pieces = [placed[rows] for rows in torch.arange(len(placed)).split(obj.parts.counts)]
@@ -102,10 +102,7 @@ class _Glb:
         chunks = struct.pack("<I4s", len(text), b"JSON") + text
         if buffer:
             chunks += struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
-        staged = path.with_name(path.name + ".part")
-        staged.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
-        staged.replace(path)
-        return path
+        return replace_file(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
 def _origins(obj: ArticulatedObject) -> list[Float[np.ndarray, " 3"]]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..geometry import SE3, Camera
 from ..model import ArticulatedObject, Splats
+from .assets import replace_file
 from .overlay import colour_of, joint_strokes
 from .page import filled, page_file
 from .sweep import telling_order
@@ -36,11 +37,7 @@ def export_html(obj: ArticulatedObject, path: Path, *, title: str = "") -> Path:
         path: of the HTML file; its folder is made.
         title: above the picture; the file's name without its ending if empty.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    staged = path.with_name(path.name + ".part")
-    staged.write_text(page_of(obj, title=title or path.stem), encoding="utf-8")
-    staged.replace(path)
-    return path
+    return replace_file(path, page_of(obj, title=title or path.stem))
 
 
 def page_of(obj: ArticulatedObject, *, title: str) -> str:

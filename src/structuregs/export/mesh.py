@@ -142,7 +142,13 @@ def without_specks(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
 
 
 def export_meshes(
-    obj: ArticulatedObject, meshes: Sequence[trimesh.Trimesh], folder: Path, *, faces: int = 20_000, size: int = 1024
+    obj: ArticulatedObject,
+    meshes: Sequence[trimesh.Trimesh],
+    folder: Path,
+    *,
+    light: Sequence[trimesh.Trimesh] | None = None,
+    faces: int = 20_000,
+    size: int = 1024,
 ) -> list[Path]:
     """Writes every part's surface twice: `base.ply`, as it is, and `base.obj` with `.mtl` and `.png`, lighter and textured.
 
@@ -150,6 +156,7 @@ def export_meshes(
         obj: names the parts.
         meshes: of its parts, in order, in the world in state 0, with vertex colours; a part without faces is left out.
         folder: made if it is not there.
+        light: the lighter, textured meshes, where they have been made already (`textured`).
         faces: of a textured mesh, at most.
         size: side of a texture, pixels.
 
@@ -157,12 +164,12 @@ def export_meshes(
         The PLY and OBJ files.
     """
     files = []
-    for name, mesh in zip(obj.parts.names, meshes, strict=True):
+    for k, (name, mesh) in enumerate(zip(obj.parts.names, meshes, strict=True)):
         if not len(mesh.faces):
             continue
         content = mesh.export(file_type="ply")
         assert isinstance(content, bytes)
         files.append(replace_file(folder / f"{name}.ply", content))
-        write_visual(textured(mesh, faces=faces, size=size), name, folder)
+        write_visual(light[k] if light is not None else textured(mesh, faces=faces, size=size), name, folder)
         files.append(folder / f"{name}.obj")
     return files

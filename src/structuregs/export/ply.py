@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from ..model import ArticulatedObject, Splats
+from .assets import replace_file
 
 
 def export_ply(obj: ArticulatedObject, folder: Path) -> list[Path]:
@@ -18,7 +19,6 @@ def export_ply(obj: ArticulatedObject, folder: Path) -> list[Path]:
         obj: what is written, in the capture's unit.
         folder: made where it is missing.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     states = [obj.parts.at_state(state) for state in (0, 1)]
     rows = torch.arange(len(states[0])).split(obj.parts.counts)
     sets = {name: states[0][row] for name, row in zip(obj.parts.names, rows, strict=True)}
@@ -31,10 +31,7 @@ def _write(splats: Splats, path: Path) -> Path:
     table = np.stack(list(columns.values()), 1).astype("<f4")
     properties = "".join(f"property float {name}\n" for name in columns)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(splats)}\n{properties}end_header\n"
-    staged = path.with_name(path.name + ".part")
-    staged.write_bytes(header.encode("ascii") + table.tobytes())
-    staged.replace(path)
-    return path
+    return replace_file(path, header.encode("ascii") + table.tobytes())
 
 
 def _columns(splats: Splats) -> dict[str, np.ndarray]:

@@ -21,6 +21,7 @@ from ..geometry import Camera
 from ..metrics import psnr
 from ..model import ArticulatedObject, Joint, Splats
 from ..raster import render
+from .assets import replace_file
 from .chart import Point, line_chart
 from .html import opening_camera
 from .overlay import colour_of, draw_structure
@@ -67,11 +68,7 @@ def write_report(run: Path, capture: Capture, obj: ArticulatedObject, *, notes: 
         sections="\n".join(section for section in sections if section),
         footer="Lengths are in the capture's unit, axes and origins in its frame. Written by structuregs.",
     )
-    file = run / "report.html"
-    staged = file.with_name(file.name + ".part")
-    staged.write_text(text, encoding="utf-8")
-    staged.replace(file)
-    return file
+    return replace_file(run / "report.html", text)
 
 
 def _section(title: str, content: str) -> str:
