@@ -20,7 +20,7 @@ from .assets import replace_file, write_visual
 from .texture import textured
 from .tsdf import Volume
 
-_SIZE = 400  # side of the images that depth is rendered in, pixels
+_SIZE = 600  # side of the images that depth is rendered in, pixels
 _VOXELS = 250  # along the object's longest side
 _TRUNCATION = 3.0  # voxels; more would close gaps and swallow thin boards
 _FEWEST = 0.025  # share of the views that must have looked at a place before a surface is drawn there

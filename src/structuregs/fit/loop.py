@@ -20,6 +20,7 @@ from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
 from .schedule import FitConfig
 from .structure import StructureWeights, contact_loss, structure_loss
+from .surface import planarity_loss, thickness
 from .variables import SPLAT_NAMES, Variables
 
 _REPORT_EVERY = 10
@@ -119,6 +120,7 @@ class Fitter:
         self.seed = seed
         self.device = device
         self.masks = [stack_views(views, config.structure_size) for views in capture.train]
+        self.faces = [stack_views(views, config.planarity_size) for views in capture.train] if config.planarity_weight else []
         self.stacks: tuple[int, list[ImageStack]] = (0, [])
 
     def run(self, steps: int) -> Iterator[FitEvent]:
@@ -222,11 +224,26 @@ class Fitter:
             )
             if (self.state.step + 1) % _REPORT_EVERY == 0:
                 squares.append(float((picture.rgb.detach() - rgb).square().mean()))
+        return loss + self._priors(parts), renders, -10 * float(np.log10(max(np.mean(squares), 1e-12))) if squares else None
+
+    def _priors(self, parts: PosedParts) -> Tensor:
+        """What is likelier whatever the photos say."""
+        config = self.config
+        loss = torch.zeros((), device=self.device)
         if config.slide_along_base and self.state.variables.kinds is not None:
             loss = loss + config.slide_along_base * askew(parts, self.state.variables.kinds)
         if config.tint_penalty:
             loss = loss + config.image_weight * config.tint_penalty * parts.tint.abs().mean()
-        return loss, renders, -10 * float(np.log10(max(np.mean(squares), 1e-12))) if squares else None
+        if config.opacity_penalty:
+            loss = loss + config.opacity_penalty * parts.splats.opacities.mean()
+        if config.thickness_penalty:
+            loss = loss + config.thickness_penalty / self.state.size * thickness(parts.splats)
+        if config.planarity_weight and self.state.step >= config.planarity_from * config.steps:
+            for s, stack in enumerate(self.faces):
+                v = self._view(s, len(stack))
+                rgb, alpha = (image.to(self.device) for image in stack.target(v))
+                loss = loss + config.planarity_weight * planarity_loss(parts.at_state(s), stack.cameras[v], rgb, alpha)
+        return loss
 
     def _rate(self, name: str) -> float:
         """The learning rate of a leaf in this step."""

@@ -87,6 +87,16 @@ class FitConfig:
     """Of the mask's error beside the colour's."""
     tint_penalty: float = 0.3
     """Of the mean absolute colour difference between the states."""
+    opacity_penalty: float = 0.2
+    """Of the splats' mean opacity: what the photos do not need fades, and less hangs before the surface (3DGS-MCMC)."""
+    thickness_penalty: float = 10.0
+    """Of the splats' mean thickness over the object's size."""
+    planarity_weight: float = 0.1
+    """Of the loss that makes faces without texture plane."""
+    planarity_from: float = 0.5
+    """Part of the fit after which faces are made plane: what is hollow has to be found hollow before."""
+    planarity_size: int = 160
+    """Size of the images that it is taken from: the side of a square with as many pixels."""
     slide_along_base: float = 1.0
     """Of the squared sine of the angle between a slide and the nearest axis of the base's box, once joints are held."""
     join_at: float = 0.35
@@ -123,6 +133,9 @@ PRESETS: dict[str, FitConfig] = {
         sizes=((0.0, 1600),),
         alpha_weight=0.0,
         tint_penalty=0.0,
+        opacity_penalty=0.0,
+        thickness_penalty=0.0,
+        planarity_weight=0.0,
         slide_along_base=0.0,
         one_joint_from=1.0,
         checkpoint_every=500,

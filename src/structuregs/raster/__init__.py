@@ -2,7 +2,19 @@
 
 from .image_loss import image_loss
 from .median import Surface, render_surface
+from .planes import PlaneImage, render_planes
 from .records import Projection, Render
 from .render import blend, project, render
 
-__all__ = ["Projection", "Render", "Surface", "blend", "image_loss", "project", "render", "render_surface"]
+__all__ = [
+    "PlaneImage",
+    "Projection",
+    "Render",
+    "Surface",
+    "blend",
+    "image_loss",
+    "project",
+    "render",
+    "render_planes",
+    "render_surface",
+]

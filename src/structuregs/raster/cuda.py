@@ -41,24 +41,31 @@ def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"]) -
     gsplat leaves out the splat that would bring a pixel's transmittance below 1e-4, where the other back ends draw it as
     the pixel's last: images agree to 1e-4.
     """
-    gsplat = _gsplat()
     splats = Splats(**{name: value.to("cuda", torch.float32) for name, value in splats.tensors().items()})
-    width, height = camera.width, camera.height
+    return blend(project(splats, camera), camera.width, camera.height, background.to(splats.means))
+
+
+def project(splats: Splats, camera: Camera) -> Projection:
+    """See `reference.project`."""
     viewmat = camera.T_world_camera.inverse().as_matrix().detach().to(splats.means)[None]
-    radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
-        splats.means, None, splats.quats, splats.scales, viewmat, camera.K.to(splats.means)[None], width, height,
-        eps2d=DILATION, near_plane=NEAR, opacities=splats.opacities,
+    radii, means2d, depths, conics, _ = _gsplat().fully_fused_projection(
+        splats.means, None, splats.quats, splats.scales, viewmat, camera.K.to(splats.means)[None], camera.width,
+        camera.height, eps2d=DILATION, near_plane=NEAR, opacities=splats.opacities,
     )  # fmt: skip
-    # One camera's rows, then back: so the gradient of the kept `xy` is the screen-space gradient.
-    projection = Projection(
-        means2d[0], conics[0], depths[0], radii[0].to(torch.float32), splat_rgb(splats, camera), splats.opacities
-    )
-    xy = projection.xy[None]
+    extent = radii[0].to(torch.float32)
+    return Projection(means2d[0], conics[0], depths[0], extent, splat_rgb(splats, camera), splats.opacities)
+
+
+def blend(projection: Projection, width: int, height: int, background: Float[Tensor, " 3"]) -> Render:
+    """See `reference.blend`."""
+    gsplat = _gsplat()
+    # From one camera's rows: so the gradient of the kept `xy` is the screen-space gradient.
+    xy, radii = projection.xy[None], projection.extent.to(torch.int32)[None]
     across, down = -(-width // _TILE), -(-height // _TILE)
-    _, pairs, order = gsplat.isect_tiles(xy, radii, depths, _TILE, across, down)
+    _, pairs, order = gsplat.isect_tiles(xy, radii, projection.depth.detach()[None], _TILE, across, down)
     starts = gsplat.isect_offset_encode(pairs, 1, across, down)
     values = torch.cat([projection.rgb, projection.depth[:, None]], -1)[None]
-    behind = torch.cat([background.to(splats.means), background.new_zeros(1).to(splats.means)])[None]
+    behind = torch.cat([background, background.new_zeros(1)])[None]
     image, alpha = gsplat.rasterize_to_pixels(
         xy, projection.conic[None], values, projection.opacity[None], width, height, _TILE, starts, order, backgrounds=behind
     )

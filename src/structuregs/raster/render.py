@@ -41,7 +41,8 @@ def render(
 
 
 def _stages(tensor: Tensor):
-    return _module("cpu" if tensor.device.type == "cpu" and tensor.dtype == torch.float32 else "reference")
+    fast = tensor.device.type if tensor.dtype == torch.float32 else ""
+    return _module(fast if fast in ("cpu", "cuda") else "reference")
 
 
 def project(splats: Splats, camera: Camera) -> Projection:

@@ -1,0 +1,63 @@
+"""The planes that splats lie in, drawn like colours: where the surface is at every pixel, and how it leans."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..geometry import Camera, quat_to_matrix
+from ..model import Splats
+from .render import blend, project
+
+_STEEPEST = 0.1  # least cosine between a plane's normal and the line of sight: seen edge-on a plane is nowhere
+_LEAST = 1e-3  # of the alpha that means are taken over
+
+
+@dataclass(frozen=True)
+class PlaneImage:
+    """The mean plane of the splats at every pixel.
+
+    Attributes:
+        planes: m, in the camera's frame: the plane is where m . x = 1, and a ray of unit z, d, meets it at depth 1 / (m . d).
+            Pixels that see one flat face all have the same m.
+        alpha: opacity in [0, 1], without gradient.
+    """
+
+    planes: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+
+
+def tangent_planes(splats: Splats, camera: Camera) -> Float[Tensor, "N 3"]:
+    """The plane through each splat's centre and square to its shortest axis, as m of `PlaneImage`.
+
+    Planes that the camera sees nearly edge-on are turned towards it.
+    """
+    T_camera_world = camera.T_world_camera.inverse().to(splats.means.device, splats.means.dtype)
+    centres = T_camera_world.apply(splats.means)
+    shortest = splats.log_scales.detach().argmin(-1)[:, None, None].expand(-1, 3, 1)
+    normals = quat_to_matrix(splats.quats).gather(2, shortest)[..., 0] @ T_camera_world.rotation.T
+    sight = torch.nn.functional.normalize(centres, dim=-1)
+    cosine = (normals * sight).sum(-1, keepdim=True)
+    normals = torch.where(cosine < 0, -normals, normals) + (_STEEPEST - cosine.abs()).clamp(min=0) * sight
+    return normals / (normals * centres).sum(-1, keepdim=True).clamp(min=1e-6)
+
+
+def render_planes(splats: Splats, camera: Camera) -> PlaneImage:
+    """Draws the splats' planes instead of their colours (unbiased depth as in PGSR, Chen et al. 2024).
+
+    Gradients reach centres and orientations by way of the planes alone, not by what covers what: a loss on the image can
+    move a surface, and has nothing to gain by making it transparent.
+    """
+    seen = project(splats, camera)
+    seen = replace(
+        seen,
+        xy=seen.xy.detach(),
+        conic=seen.conic.detach(),
+        depth=seen.depth.detach(),
+        opacity=seen.opacity.detach(),
+        rgb=tangent_planes(splats, camera),
+    )
+    image = blend(seen, camera.width, camera.height, splats.means.new_zeros(3))
+    alpha = image.alpha.detach()
+    return PlaneImage(image.rgb / alpha.clamp(min=_LEAST)[..., None], alpha)
