@@ -10,6 +10,7 @@ from torch import Tensor
 from structuregs.boxes import (
     CueConfig,
     MovingPart,
+    PartSearch,
     SearchConfig,
     StartConfig,
     StateLook,
@@ -345,6 +346,16 @@ class TestParts:
             assert degrees < 6
             assert gap < 0.08
         assert parts[0].gain == max(part.gain for part in parts)
+
+    def test_what_no_motion_explains_is_left_over_and_told(self):
+        looks = looks_of("laptop")[1]
+        search = PartSearch(looks, SMALL.search, seed=0)
+        assert len(search.search(None)) == 1
+        assert search.left_over == []
+        never = PartSearch(looks, replace(SMALL.search, harm=-9.0), seed=0)  # a gain of nine times the photos' error
+        assert never.search(None) == []
+        assert {state for state, _ in never.left_over} == {0, 1}
+        assert all(SMALL.search.large < share < 1 for _, share in never.left_over)
 
     def test_nothing_moves_in_a_still_object(self):
         assert parts_of("static") == []

@@ -90,6 +90,7 @@ class PartSearch:
         self.clusters = clusters(looks, config.cue)[: config.most]
         self.boxes = [self._box(cluster.points) for cluster in self.clusters]
         self.base_box = self._box(self._still_points())
+        self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
 
     def _box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
         return box_around(points, thinnest=0.5 * self.voxel)
@@ -128,6 +129,7 @@ class PartSearch:
         """The search, bit by bit: yields how many clusters are done with, and returns the parts, the best first."""
         parts: list[MovingPart] = []
         explained: set[int] = set()
+        refused: dict[int, tuple[int, float]] = {}
         for index in range(len(self.clusters)):
             yield index
             if index in explained:
@@ -135,9 +137,12 @@ class PartSearch:
             part, members = self._try(index, parts, explained)
             share = len(part.points) / len(self.looks[part.state].points)
             if part.gain < (-self.config.harm if share > self.config.large else NOISE):
+                if share > self.config.large:
+                    refused[index] = (part.state, share)
                 continue
             parts.append(part)
             explained |= members | self._explained_by(part)
+        self.left_over = [what for index, what in refused.items() if index not in explained]
         if len(parts) > 1:
             parts = self._settled(self._without_pieces(self._reconsider(parts)))
         return sorted(parts, key=lambda part: -part.weight)

@@ -126,7 +126,12 @@ def start_parts(
     generator = torch.Generator().manual_seed(seed)
     filling = (config.splats_per_part, config.sh_degree, generator)
     if config.hypotheses:
-        found = (yield from _searched(PartSearch(pair, config.start.search, seed)))[:parts]
+        search = PartSearch(pair, config.start.search, seed)
+        found = (yield from _searched(search))[:parts]
+        for state, share in search.left_over:
+            yield Note(
+                f"{share:.0%} of what state {state} shows is in no part: no one motion puts it where state {1 - state} has it"
+            )
         boxes, motions = boxes_of_parts(pair, found, config.start)
         posed = seeded(boxes, motions, pair, found, *filling)
     else:
