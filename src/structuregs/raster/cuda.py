@@ -41,6 +41,7 @@ def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"]) -
     gsplat leaves out the splat that would bring a pixel's transmittance below 1e-4, where the other back ends draw it as
     the pixel's last: images agree to 1e-4.
     """
+    _gsplat()
     splats = Splats(**{name: value.to("cuda", torch.float32) for name, value in splats.tensors().items()})
     return blend(project(splats, camera), camera.width, camera.height, background.to(splats.means))
 
