@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +149,15 @@ def test_the_same_object_gives_the_same_meshes():
     for a, b in zip(once, twice, strict=True):
         assert np.array_equal(a.vertices, b.vertices)
         assert np.array_equal(a.visual.vertex_colors, b.visual.vertex_colors)
+
+
+def test_a_part_that_cannot_be_seen_has_an_empty_surface_that_can_be_moved():
+    parts, capture = two_cubes()
+    unseen = replace(parts, splats=replace(parts.splats, logit_opacities=parts.splats.logit_opacities.clone()))
+    unseen.splats.logit_opacities[parts.counts[0] :] = -9.0
+    _, mesh = part_meshes(articulate(unseen), capture, voxel=0.04)
+    assert not len(mesh.faces)
+    assert not len(mesh.copy().apply_transform(np.diag([1.0, -1, -1, 1])).faces)
 
 
 def test_specks_go_and_handles_stay():

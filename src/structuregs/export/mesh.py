@@ -117,6 +117,8 @@ def _volume(half_extents: Float64[np.ndarray, " 3"], voxel: float) -> Volume:
 
 def _mesh(volume: Volume, box: Box, fewest: float) -> trimesh.Trimesh:
     vertices, faces, rgb = volume.surface(fewest)
+    if not len(faces):
+        return trimesh.Trimesh()  # with no colours: trimesh cannot copy colours of no vertices
     world = box.T_world_box.to(dtype=torch.float64).apply(torch.from_numpy(vertices)).numpy()
     rgba = np.concatenate([np.rint(rgb.clip(0, 1) * 255), np.full((len(rgb), 1), 255)], 1).astype(np.uint8)
     return without_specks(trimesh.Trimesh(world, faces, process=False, vertex_colors=rgba), _SPECK)
