@@ -18,7 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 STRUCTUREGS = str(Path(sys.executable).with_name("structuregs"))
-HEAD = ("capture", "joint", "axis deg", "position", "turn deg", "slide", "PSNR", "CD static", "CD movable", "CD whole")
+HEAD = (
+    *("capture", "joint", "axis deg", "position", "turn deg", "slide", "PSNR"),
+    *("CD static", "CD movable", "CD whole", "seconds", "peak GB"),
+)
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ def rows(jobs: Sequence[Job]) -> list[tuple[str, ...]]:
 
 def table(jobs: Sequence[Job]) -> str:
     """The table of all jobs in Markdown."""
-    lines = [(*HEAD, "seconds", "peak GB"), ("---",) * (len(HEAD) + 2)]
+    lines = [HEAD, ("---",) * len(HEAD)]
     for capture in dict.fromkeys(job.capture for job in jobs):
         lines += rows([job for job in jobs if job.capture == capture])
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

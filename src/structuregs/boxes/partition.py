@@ -136,8 +136,9 @@ class PartSearch:
                 continue
             part, members = self._try(index, parts, explained)
             share = len(part.points) / len(self.looks[part.state].points)
-            if part.gain < (-self.config.harm if share > self.config.large else NOISE):
-                if share > self.config.large:
+            large = share > self.config.large
+            if part.gain < (-self.config.harm if large else NOISE):
+                if large:
                     refused[index] = (part.state, share)
                 continue
             parts.append(part)

@@ -115,8 +115,8 @@ def choose_device(name: str) -> torch.device:
 
 def start_parts(
     capture: Capture, config: FitConfig, *, parts: int | None, points: str, seed: int
-) -> Iterator[FitEvent | PosedParts]:
-    """Boxes, motions and the splats strewn in them; the last thing yielded is the `PosedParts`."""
+) -> Generator[FitEvent, None, PosedParts]:
+    """Boxes, motions and the splats strewn in them, its progress as events."""
     yield StageStarted("look", 2)
     looks = []
     for look in look_at_states(capture, points, config.start, seed):
@@ -141,7 +141,7 @@ def start_parts(
     yield Note(f"{count} moving part{'' if count == 1 else 's'} found")
     if parts is not None and count != parts:
         yield Note(f"{parts} were asked for: what else moves does not show in masks and photos")
-    yield posed
+    return posed
 
 
 def _searched(search: PartSearch) -> Generator[FitEvent, None, list[MovingPart]]:
@@ -242,13 +242,7 @@ def fit_run(
         folder.cut_metrics(state.step)
         yield Note(f"going on from step {state.step}")
     else:
-        begun = None
-        for item in start_parts(capture, config, parts=parts, points=points, seed=seed):
-            if isinstance(item, PosedParts):
-                begun = item
-            else:
-                yield item
-        assert begun is not None
+        begun = yield from start_parts(capture, config, parts=parts, points=points, seed=seed)
         state = FitState.start(begun.to(chosen))
         state.save(folder.checkpoint)
         clock.save()

@@ -49,15 +49,8 @@ def render_planes(splats: Splats, camera: Camera) -> PlaneImage:
     Gradients reach centres and orientations by way of the planes alone, not by what covers what: a loss on the image can
     move a surface, and has nothing to gain by making it transparent.
     """
-    seen = project(splats, camera)
-    seen = replace(
-        seen,
-        xy=seen.xy.detach(),
-        conic=seen.conic.detach(),
-        depth=seen.depth.detach(),
-        opacity=seen.opacity.detach(),
-        rgb=tangent_planes(splats, camera),
-    )
-    image = blend(seen, camera.width, camera.height, splats.means.new_zeros(3))
+    with torch.no_grad():
+        seen = project(splats, camera)
+    image = blend(replace(seen, rgb=tangent_planes(splats, camera)), camera.width, camera.height, splats.means.new_zeros(3))
     alpha = image.alpha.detach()
     return PlaneImage(image.rgb / alpha.clamp(min=_LEAST)[..., None], alpha)
