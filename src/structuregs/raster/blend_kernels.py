@@ -12,6 +12,7 @@ import numpy as np
 from numba import prange
 
 from ..jit import fast_exp2, kernel
+from .moments import lane_moments
 from .records import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 TILE = 16
@@ -22,9 +23,9 @@ _TINY = np.float32(1e-30)
 _LOG2_E = np.float32(math.log2(math.e))
 _LOWEST, _HIGHEST = np.float32(math.log2(MIN_ALPHA) - 0.01), np.float32(math.log2(MAX_ALPHA))
 _SLACK = np.float32(1e-2)  # pixels; spans are rounded outwards, each pixel's own alpha decides
-# Where the planes of a tile lie after that of transmittance; the sums of the columns and the terms of the rows share one.
+# Where the planes of a tile lie after that of transmittance; the last holds sums over columns.
 _R, _G, _B, _D, _S, _SUMS = (plane * TILE * TILE for plane in range(1, 7))
-_ROWS = _SUMS + 8 * TILE
+_POSITIVE = 0x7FFFFFFF  # masks an index, so that the compiler need not think of negative ones
 _CHECK = 16  # splats between two looks at whether a tile is full
 
 
@@ -179,17 +180,6 @@ def _planes(count):
     return memory, (-(memory.ctypes.data // 4)) & 15
 
 
-@kernel()
-def _row_terms(M, terms, gy, s):
-    """Writes what the exponent's rows have in common: constant and linear term in dx, and dy."""
-    b, c, peak = s[3], s[4], s[5]
-    for y in range(TILE):
-        dy = gy - np.float32(np.int32(y))
-        M[terms + y] = peak + c * dy * dy
-        M[terms + TILE + y] = b * dy
-        M[terms + 2 * TILE + y] = dy
-
-
 @kernel(parallel=True)
 def blend_forward(starts, splats, drawing, background, lanes, image, alpha, depth, ends):
     """Fills image (H W 3), alpha (H W), depth (H W), and where each tile's list was left, ends (tiles).
@@ -207,10 +197,9 @@ def blend_forward(starts, splats, drawing, background, lanes, image, alpha, dept
 @kernel(inline=False)
 def _blend_tile(tile, starts, splats, drawing, background, across, image, alpha, depth, ends):
     height, width = alpha.shape
-    x0, y0 = (tile % across) * TILE, (tile // across) * TILE
+    x0, y0 = (tile % across) * TILE & _POSITIVE, (tile // across) * TILE & _POSITIVE
     h, w = min(TILE, height - y0), min(TILE, width - x0)
     M, base = _planes(7)
-    terms = base + _ROWS
     for y in range(h):
         for x in range(w):
             M[base + y * TILE + x] = _ONE
@@ -220,11 +209,12 @@ def _blend_tile(tile, starts, splats, drawing, background, across, image, alpha,
         k += 1
         gx, gy, a = s[0] - np.float32(x0), s[1] - np.float32(y0), s[2]
         r, g, bl, z = s[6], s[7], s[8], s[9]
-        _row_terms(M, terms, gy, s)
+        b, c, peak = s[3], s[4], s[5]
         first, last = _pixel_rows(s, -gx, -gy)
         for y in range(first, last):
             row = base + (y & 15) * TILE
-            constant, linear = M[terms + (y & 15)], M[terms + TILE + (y & 15)]
+            dy = gy - np.float32(np.int32(y))
+            constant, linear = peak + c * dy * dy, b * dy
             for x in range(TILE):
                 j = row + x
                 dx = gx - np.float32(np.int32(x))
@@ -270,9 +260,11 @@ def blend_backward(starts, splats, drawing, ends, lanes, image, alpha, depth, g_
 @kernel(inline=False)
 def _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, depth, g_image, g_alpha, g_depth, partials):
     height, width = alpha.shape
-    x0, y0 = (tile % across) * TILE, (tile // across) * TILE
+    if starts[tile] == ends[tile]:
+        return
+    x0, y0 = (tile % across) * TILE & _POSITIVE, (tile // across) * TILE & _POSITIVE
     M, base = _planes(7)
-    sums, terms = base + _SUMS, base + _ROWS
+    sums = base + _SUMS
     for y in range(min(TILE, height - y0)):
         for x in range(min(TILE, width - x0)):
             i, j, m = y0 + y, x0 + x, base + y * TILE + x
@@ -290,13 +282,13 @@ def _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, dep
         gx, gy, a = s[0] - np.float32(x0), s[1] - np.float32(y0), s[2]
         r, g, bl, z = s[6], s[7], s[8], s[9]
         first, last = _pixel_rows(s, -gx, -gy)
-        _row_terms(M, terms, gy, s)
+        b, c, peak = s[3], s[4], s[5]
         for j in range(sums, sums + 7 * TILE):
             M[j] = _ZERO
         for y in range(first, last):
             row = base + (y & 15) * TILE
-            constant, linear = M[terms + (y & 15)], M[terms + TILE + (y & 15)]
-            dy = M[terms + 2 * TILE + (y & 15)]
+            dy = gy - np.float32(np.int32(y))
+            constant, linear = peak + c * dy * dy, b * dy
             for x in range(TILE):
                 j, q = row + x, sums + x
                 dx = gx - np.float32(np.int32(x))
@@ -329,22 +321,12 @@ def _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, dep
 @kernel()
 def _write_partials(M, sums, gx, out):
     """From sums over a tile's columns to moments of one splat; dx and its square are the same down a column."""
-    g0, gu, gv, guu, guv, gvv = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-    red, green, blue, z = _ZERO, _ZERO, _ZERO, _ZERO
-    for x in range(TILE):
-        dx = gx - np.float32(np.int32(x))
-        g0 += M[sums + x]
-        gu += M[sums + x] * dx
-        guu += M[sums + x] * dx * dx
-        gv += M[sums + 16 + x]
-        guv += M[sums + 16 + x] * dx
-        gvv += M[sums + 32 + x]
-        red += M[sums + 48 + x]
-        green += M[sums + 64 + x]
-        blue += M[sums + 80 + x]
-        z += M[sums + 96 + x]
-    out[0], out[1], out[2], out[3], out[4], out[5] = g0, gu, gv, guu, guv, gvv
-    out[6], out[7], out[8], out[9] = red, green, blue, z
+    lane_moments(M, sums, out)
+    middle = gx - np.float32((TILE - 1) / 2)
+    g0, gx1, gy1 = out[0], out[1], out[2]
+    out[1] = middle * g0 - gx1
+    out[3] += middle * (middle * g0 - _TWO * gx1)
+    out[4] = middle * gy1 - out[4]
 
 
 @kernel()
