@@ -10,6 +10,7 @@ from structuregs.fit.structure import (
     coverage_loss,
     extent_loss,
     margin_loss,
+    occupancy_loss,
     structure_images,
     structure_loss,
     union,
@@ -174,6 +175,23 @@ class TestStructureLoss:
         loose = structure_loss(boxes, motions, (camera, camera), masks, weights, 0.05, loose=True)
         assert tight.item() == pytest.approx(parts, rel=1e-5)
         assert loose.item() == pytest.approx(parts + contacts + 11 * float(extent_loss(boxes)), rel=1e-5)
+
+    @pytest.mark.parametrize("count", [1, 2, 5])
+    def test_the_kernel_is_the_torch_loss_in_value_and_gradient(self, count: int):
+        generator = torch.Generator().manual_seed(count)
+        tangents = 0.4 * torch.randn(count, 6, generator=generator, dtype=F64)
+        half_extents = 0.2 + 0.4 * torch.rand(count, 3, generator=generator, dtype=F64)
+        camera, mask = camera_at(0.7, 0.3, 40), (torch.rand(40, 40, generator=generator) > 0.4).to(F64)
+        origin, rays = unit_rays(camera)
+        results = []
+        for dtype in (torch.float32, F64):
+            leaves = [value.to(dtype).requires_grad_() for value in (tangents, half_extents)]
+            boxes = Box(SE3.exp(leaves[0]), leaves[1])
+            loss = occupancy_loss(boxes, origin.to(dtype), rays.to(dtype), mask.to(dtype), StructureWeights(), 0.05)
+            (3 * loss).backward()
+            results.append((loss, leaves[0].grad, leaves[1].grad))
+        for fast, exact in zip(*results, strict=True):
+            assert (fast - exact).norm() <= 1e-3 * exact.norm()
 
     def test_the_weights_are_the_supplement_s(self):
         assert StructureWeights() == StructureWeights(coverage=100.0, margin=50.0, contact=0.1, extent=0.01)

@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from structuregs.fit.surface import planarity_loss, thickness
+from structuregs.fit.surface import planarity_loss, slopes, thickness
 from structuregs.geometry import SE3, Camera
 from structuregs.model import Splats
 from structuregs.raster import render_planes
+from structuregs.raster.planes import tangent_planes
 
 CAMERA = Camera(SE3.identity(), 70.0, 70.0, 32.0, 32.0, 64, 64)
 
@@ -56,8 +57,47 @@ class TestPlanes:
         assert leaves["means"].grad is not None
         assert leaves["means"].grad.abs().max() > 0
 
+    @pytest.mark.parametrize("part", ["means", "quats"])
+    def test_their_gradients_are_the_references(self, part: str):
+        generator = torch.Generator().manual_seed(3)
+        splats = Splats(
+            torch.randn(300, 3, generator=generator) + torch.tensor([0.0, 0, 4]),
+            torch.randn(300, 4, generator=generator),
+            torch.randn(300, 3, generator=generator),
+            torch.zeros(300),
+            torch.zeros(300, 1, 3),
+        )
+        camera = replace(CAMERA, T_world_camera=SE3.exp(torch.tensor([0.1, 0.2, -0.3, 0.1, -0.2, 0.4])))
+        weights = torch.randn(300, 3, generator=generator)
+        gradients, values = [], []
+        for dtype in (torch.float32, torch.float64):
+            leaves = {name: value.to(dtype).clone().requires_grad_() for name, value in splats.tensors().items()}
+            planes = tangent_planes(Splats(**leaves), camera)
+            (planes * weights).sum().backward()
+            values.append(planes.detach())
+            gradients.append(leaves[part].grad)
+        torch.testing.assert_close(values[0].double(), values[1], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(gradients[0].double(), gradients[1], rtol=1e-3, atol=1e-4)
+
 
 class TestPlanarity:
+    @pytest.mark.parametrize("size", [(64, 64), (31, 70), (7, 9)])
+    def test_the_kernel_is_the_torch_loss_in_value_and_gradient(self, size: tuple[int, int]):
+        generator = torch.Generator().manual_seed(1)
+        camera = replace(CAMERA, fx=80.0, width=size[1], height=size[0])
+        rough = torch.tensor([0.1, -0.05, 0.33]) + 0.01 * torch.randn(*size, 3, generator=generator)
+        solid = torch.rand(size, generator=generator) > 0.2
+        changes = torch.stack([(0.02 * torch.rand(size, generator=generator)).cumsum(axis) for axis in (0, 1)])
+        values, gradients = [], []
+        for dtype in (torch.float32, torch.float64):
+            planes = rough.to(dtype).clone().requires_grad_()
+            value = slopes(planes, camera, solid, changes.to(dtype))
+            (2 * value).backward()
+            values.append(value.item())
+            gradients.append(planes.grad)
+        assert values[0] == pytest.approx(values[1], rel=1e-4)
+        torch.testing.assert_close(gradients[0].double(), gradients[1], rtol=1e-3, atol=1e-4 * float(gradients[1].abs().max()))
+
     def test_a_wall_has_none_whatever_its_slope(self):
         for normal in (unit(0, 0, 1), unit(0.4, -0.3, 1)):
             assert planarity_loss(wall(normal, 3.0), CAMERA, GREY, WHOLE) < 2e-3

@@ -34,7 +34,7 @@ class ImageStack:
 
     def target(self, v: int) -> tuple[Float32[Tensor, "H W 3"], Float32[Tensor, "H W"]]:
         """Colours over white and coverage of one view, in [0, 1]."""
-        return torch.from_numpy(self.rgb[v]).float() / 255, torch.from_numpy(self.alpha[v]).float() / 255
+        return torch.from_numpy(self.rgb[v]).float().div_(255), torch.from_numpy(self.alpha[v]).float().div_(255)
 
 
 def stack_views(views: Sequence[View], size: int) -> ImageStack:

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..capture import Capture, ImageStack, stack_views
 from ..geometry import SE3, JointKind
 from ..joints import kind_of
-from ..model import PosedParts
+from ..model import PosedParts, Splats
 from ..raster import image_loss, render
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
@@ -210,12 +210,13 @@ class Fitter:
     def _image_loss(self, parts: PosedParts) -> tuple[Tensor, list, float | None]:
         config = self.config
         growing = self.state.step < config.growth.last * config.steps
-        loss = torch.zeros((), device=self.device)
+        posed = [parts.at_state(s) for s in (0, 1)]
+        loss = self._priors(parts, posed)
         renders, squares = [], []
         for s, stack in enumerate(self._images()):
             v = self._view(s, len(stack))
             rgb, alpha = (image.to(self.device) for image in stack.target(v))
-            picture = render(parts.at_state(s), stack.cameras[v])
+            picture = render(posed[s], stack.cameras[v])
             if growing:
                 picture.projection.xy.retain_grad()
                 renders.append((picture, max(picture.alpha.shape) / config.image_weight))
@@ -224,10 +225,10 @@ class Fitter:
             )
             if (self.state.step + 1) % _REPORT_EVERY == 0:
                 squares.append(float((picture.rgb.detach() - rgb).square().mean()))
-        return loss + self._priors(parts), renders, -10 * float(np.log10(max(np.mean(squares), 1e-12))) if squares else None
+        return loss, renders, -10 * float(np.log10(max(np.mean(squares), 1e-12))) if squares else None
 
-    def _priors(self, parts: PosedParts) -> Tensor:
-        """What is likelier whatever the photos say."""
+    def _priors(self, parts: PosedParts, posed: Sequence[Splats]) -> Tensor:
+        """What is likelier whatever the photos say; posed: the splats in both states."""
         config = self.config
         loss = torch.zeros((), device=self.device)
         if config.slide_along_base and self.state.variables.kinds is not None:
@@ -242,7 +243,7 @@ class Fitter:
             for s, stack in enumerate(self.faces):
                 v = self._view(s, len(stack))
                 rgb, alpha = (image.to(self.device) for image in stack.target(v))
-                loss = loss + config.planarity_weight * planarity_loss(parts.at_state(s), stack.cameras[v], rgb, alpha)
+                loss = loss + config.planarity_weight * planarity_loss(posed[s], stack.cameras[v], rgb, alpha)
         return loss
 
     def _rate(self, name: str) -> float:

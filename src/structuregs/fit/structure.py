@@ -6,11 +6,14 @@ box's own frame, and occupancy is a smooth function of the chord between entry a
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ..geometry import SE3, Box, Camera
+from ..jit import lanes
 
 
 def structure_images(
@@ -111,8 +114,51 @@ def structure_loss(
     for camera, mask, posed in zip(cameras, masks, (boxes, boxes.moved(motions)), strict=True):
         origin, directions = camera.rays()
         rays = torch.nn.functional.normalize(directions, dim=-1).to(mask.device)
-        images = structure_images(posed, origin.to(mask.device), rays, softness)
-        total = total + weights.coverage * coverage_loss(images, mask) + weights.margin * margin_loss(images, mask)
+        total = total + occupancy_loss(posed, origin.to(mask.device), rays, mask, weights, softness)
         if loose:
             total = total + weights.contact * contact_loss(posed)
     return total + weights.extent * extent_loss(boxes) if loose else total
+
+
+def occupancy_loss(
+    boxes: Box,
+    origin: Float[Tensor, " 3"],
+    rays: Float[Tensor, "H W 3"],
+    mask: Float[Tensor, "H W"],
+    weights: StructureWeights,
+    softness: float,
+) -> Float[Tensor, ""]:
+    """Coverage and margin of K boxes in one view, weighted; arguments as of `structure_images`.
+
+    On the CPU in float32 a kernel, elsewhere plain torch.
+    """
+    pose = boxes.T_world_box
+    if mask.device.type == "cpu" and pose.xyz.dtype == torch.float32:
+        return _Occupancy.apply(pose.rotation, pose.xyz, boxes.half_extents, origin, rays, mask, weights, softness)
+    images = structure_images(boxes, origin, rays, softness)
+    return weights.coverage * coverage_loss(images, mask) + weights.margin * margin_loss(images, mask)
+
+
+class _Occupancy(torch.autograd.Function):
+    """`occupancy_loss` as a kernel; the gradient is made along with the value."""
+
+    @staticmethod
+    def forward(ctx, rotations, centres, half_extents, origin, rays, mask, weights, softness) -> Tensor:
+        from .structure_kernels import GRADIENTS, occupancy_losses
+
+        arrays = [t.detach().float().contiguous().numpy() for t in (rotations, centres, half_extents)]
+        view = [t.detach().float().contiguous().numpy() for t in (origin, rays, mask)]
+        hardness = np.minimum(0.5 * arrays[2].min(-1), np.float32(softness))
+        both = np.array([weights.coverage, weights.margin], np.float32) / np.float32(mask.numel())
+        sums = np.empty((len(mask), 1 + GRADIENTS * len(centres)))
+        with lanes() as threads:
+            occupancy_losses(*arrays, hardness, np.float32(softness), *view, both, threads, sums)
+        total = torch.from_numpy(sums.sum(0)).to(centres.dtype)
+        ctx.save_for_backward(*total[1:].view(-1, GRADIENTS).split((9, 3, 3), 1))
+        return total[0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        rotations, centres, half_extents = (g * gradients[0] for g in ctx.saved_tensors)
+        return rotations.reshape(-1, 3, 3), centres, half_extents, None, None, None, None, None

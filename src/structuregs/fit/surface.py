@@ -39,36 +39,15 @@ def planarity_loss(
     solid = (image.alpha > 0.5) & (alpha > 0.5)
     photo = torch.cat([rgb, alpha[..., None]], -1)
     changes = torch.stack([photo.diff(dim=d, prepend=photo.narrow(d, 0, 1)).abs().mean(-1).cumsum(d) for d in (0, 1)])
-    fast = image.planes.device.type == "cpu" and image.planes.dtype == torch.float32
-    total = (_Slopes.apply if fast else slopes_reference)(image.planes, camera, solid, changes)
-    return total / (4 * len(_STEPS) * solid.sum().clamp(min=1))
+    return slopes(image.planes, camera, solid, changes) / (4 * len(_STEPS) * solid.sum().clamp(min=1))
 
 
-class _Slopes(torch.autograd.Function):
-    """See `slopes_reference`; the gradient is made along with the value."""
-
-    @staticmethod
-    def forward(ctx, planes, camera, solid, changes) -> Tensor:
-        from .surface_kernels import slopes
-
-        arrays = [t.detach().float().contiguous().numpy() for t in (planes, solid, changes)]
-        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-        gradient, parts = np.empty_like(arrays[0]), np.empty(len(arrays[0]))
-        with lanes() as threads:
-            slopes(*arrays, lens, np.array(_STEPS), _EDGE, np.float32(_LEAST_NEARNESS), threads, gradient, parts)
-        ctx.save_for_backward(torch.from_numpy(gradient))
-        return torch.tensor(parts.sum(), dtype=planes.dtype)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *gradients):
-        return ctx.saved_tensors[0] * gradients[0], None, None, None
-
-
-def slopes_reference(
+def slopes(
     planes: Float[Tensor, "H W 3"], camera: Camera, solid: Bool[Tensor, "H W"], changes: Float[Tensor, "2 H W"]
 ) -> Float[Tensor, ""]:
-    """Sum over pairs of pixels of how much the one's plane misses the other, over the way between them; in plain torch.
+    """Sum over pairs of pixels of how much the one's plane misses the other, over the way between them.
+
+    On the CPU in float32 a kernel, elsewhere plain torch.
 
     Args:
         planes: see `PlaneImage`.
@@ -76,6 +55,8 @@ def slopes_reference(
         solid: where there is a surface.
         changes: how much the photo's colours have changed up to a pixel, down its column and along its row.
     """
+    if planes.device.type == "cpu" and planes.dtype == torch.float32:
+        return _Slopes.apply(planes, camera, solid, changes)
     rays = camera.rays()[1].to(planes) @ camera.T_world_camera.rotation.to(planes)
     nearness = (planes * rays).sum(-1).clamp(min=_LEAST_NEARNESS)
     total = nearness.new_zeros(())
@@ -91,3 +72,24 @@ def slopes_reference(
                 for miss in ((plane_a * ray_b).sum(-1) / near_b - 1, (plane_b * ray_a).sum(-1) / near_a - 1):
                     total = total + (weight * (focal / step * miss.abs()).clamp(max=1)).sum()
     return total
+
+
+class _Slopes(torch.autograd.Function):
+    """`slopes` as a kernel; the gradient is made along with the value."""
+
+    @staticmethod
+    def forward(ctx, planes, camera, solid, changes) -> Tensor:
+        from .surface_kernels import slopes_and_gradient
+
+        arrays = [t.detach().float().contiguous().numpy() for t in (planes, solid, changes)]
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+        gradient, parts = np.empty_like(arrays[0]), np.empty(len(arrays[0]))
+        with lanes() as threads:
+            slopes_and_gradient(*arrays, lens, np.array(_STEPS), _EDGE, np.float32(_LEAST_NEARNESS), threads, gradient, parts)
+        ctx.save_for_backward(torch.from_numpy(gradient))
+        return torch.tensor(parts.sum(), dtype=planes.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        return ctx.saved_tensors[0] * gradients[0], None, None, None

@@ -40,7 +40,7 @@ def _row(P, Q, change_p, change_q, ray_p, ray_q, steepness, edge, lowest, sums):
 
 
 @kernel(parallel=True)
-def slopes(planes, solid, changes, lens, steps, edge, lowest, lanes, gradient, parts):
+def slopes_and_gradient(planes, solid, changes, lens, steps, edge, lowest, lanes, gradient, parts):
     """Fills gradient (H W 3) of the sum of all pairs' slopes by the planes, and parts (H), each row's share of the sum.
 
     Args:

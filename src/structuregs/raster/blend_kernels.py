@@ -135,28 +135,42 @@ def tile_lists(reach, order, width, height, lanes):
         splats: the lists, one after the other.
     """
     across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    rows = np.zeros(lanes + 1, np.int64)
+    for lane in prange(lanes):
+        total = 0
+        for q in range(len(order)):
+            y0, y1 = _tile_rows(reach[order[q]], down * lane // lanes, down * (lane + 1) // lanes)
+            total += y1 - y0
+        rows[lane + 1] = total
+    for lane in range(lanes):
+        rows[lane + 1] += rows[lane]
+    # What a splat reaches of a row of tiles costs two roots: kept for the second round.
+    columns = np.empty((rows[-1], 2), np.int32)
     heads = np.zeros(across * down + 1, np.int64)
     last = np.float32(width - 1)
     for lane in prange(lanes):
+        row = rows[lane]
         for q in range(len(order)):
             r = reach[order[q]]
             y0, y1 = _tile_rows(r, down * lane // lanes, down * (lane + 1) // lanes)
             for y in range(y0, y1):
                 x0, x1 = _tile_columns(r, y, last)
+                columns[row, 0], columns[row, 1] = x0, x1
+                row += 1
                 for x in range(x0, x1):
                     heads[y * across + x + 1] += 1
     for tile in range(across * down):
         heads[tile + 1] += heads[tile]
     starts, splats = heads.copy(), np.empty(heads[-1], np.int32)
     for lane in prange(lanes):
+        row = rows[lane]
         for q in range(len(order)):
-            r = reach[order[q]]
-            y0, y1 = _tile_rows(r, down * lane // lanes, down * (lane + 1) // lanes)
+            y0, y1 = _tile_rows(reach[order[q]], down * lane // lanes, down * (lane + 1) // lanes)
             for y in range(y0, y1):
-                x0, x1 = _tile_columns(r, y, last)
-                for x in range(x0, x1):
+                for x in range(columns[row, 0], columns[row, 1]):
                     splats[heads[y * across + x]] = order[q]
                     heads[y * across + x] += 1
+                row += 1
     return starts, splats
 
 
@@ -321,7 +335,7 @@ def _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, dep
 @kernel()
 def _write_partials(M, sums, gx, out):
     """From sums over a tile's columns to moments of one splat; dx and its square are the same down a column."""
-    lane_moments(M, sums, out)
+    lane_moments(M, sums, out)  # pyright: ignore[reportCallIssue]
     middle = gx - np.float32((TILE - 1) / 2)
     g0, gx1, gy1 = out[0], out[1], out[2]
     out[1] = middle * g0 - gx1

@@ -12,8 +12,9 @@ from ..geometry import Camera
 from ..jit import lanes
 from ..model import Splats
 from . import blend_kernels as bk
+from . import plane_kernels as plk
 from . import project_kernels as pk
-from .records import Projection, Render, frustum_limits, splat_rgb
+from .records import LEAST_DISTANCE, STEEPEST, Projection, Render, frustum_limits, splat_rgb
 
 
 def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"]) -> Render:
@@ -37,6 +38,13 @@ def blend(projection: Projection, width: int, height: int, background: Float[Ten
     p = projection
     rgb, alpha, depth = _Blend.apply(p.xy, p.conic, p.depth, p.rgb, p.opacity, p.extent, background, (height, width))
     return Render(rgb, alpha, depth, projection)
+
+
+def tangent_planes(splats: Splats, camera: Camera) -> Float[Tensor, "N 3"]:
+    """See `planes.tangent_planes`; gives no gradient to the camera's pose."""
+    T_camera_world = camera.T_world_camera.inverse()
+    view = (_array(T_camera_world.rotation), _array(T_camera_world.xyz), np.float32(STEEPEST), np.float32(LEAST_DISTANCE))
+    return _Planes.apply(splats.means, splats.quats, splats.log_scales.detach(), view)
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -81,6 +89,28 @@ class _Project(torch.autograd.Function):
             pk.project_backward(*map(_array, inputs), *ctx.view, _array(opacity), _array(extent), *incoming, *outgoing)
         dtypes = [*(t.dtype for t in inputs), ctx.logit_dtype]
         return *(t.to(dtype) for t, dtype in zip(_tensors(outgoing), dtypes, strict=True)), None
+
+
+class _Planes(torch.autograd.Function):
+    """Splats to the planes that they lie in."""
+
+    @staticmethod
+    def forward(ctx, means, quats, log_scales, view):
+        ctx.save_for_backward(means, quats, log_scales)
+        ctx.view = view
+        planes = np.empty((len(means), 3), np.float32)
+        with lanes():
+            plk.planes_forward(_array(means), _array(quats), _array(log_scales), *view, planes)
+        return torch.from_numpy(planes)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients):
+        inputs = [_array(t) for t in ctx.saved_tensors]
+        outgoing = [np.empty_like(a) for a in inputs[:2]]
+        with lanes():
+            plk.planes_backward(*inputs, *ctx.view, _array(gradients[0]), *outgoing)
+        return *_tensors(outgoing), None, None
 
 
 class _Blend(torch.autograd.Function):

@@ -7,6 +7,9 @@ from torch import Tensor
 from ..geometry import Camera
 from ..model import Splats
 from .records import DILATION, NEAR, Projection, Render, splat_rgb
+from .reference import tangent_planes
+
+__all__ = ["blend", "project", "render", "tangent_planes"]
 
 _TILE = 16
 

@@ -1,4 +1,7 @@
-"""Sums over the lanes of vectors, as LLVM instructions: what the compiler makes of the same sums as loops is several times slower."""
+"""Sums over the lanes of vectors, as LLVM instructions.
+
+Written as loops they become gathers or scalars, and take as long as all the rest of the blend's backward pass.
+"""
 
 from llvmlite import ir
 from numba import types
@@ -25,7 +28,7 @@ def _halved(builder, a, b, segment: int):
 
 
 @intrinsic
-def lane_moments(typingctx, table, start, out):  # pyright: ignore[reportUnusedParameter]
+def lane_moments(typingctx, table, start, out):  # noqa: ARG001
     """Writes sums over 16 lanes to `out` (10): of s0, s0 x, s1, s0 x^2, s1 x, s2, s3, s4, s5, s6.
 
     Row s_r is `table[start + 16 r:][:16]`, float32; x counts the lanes from their middle, -7.5 to 7.5.
@@ -33,9 +36,7 @@ def lane_moments(typingctx, table, start, out):  # pyright: ignore[reportUnusedP
     """
 
     def generate(context, builder, signature, arguments):
-        source, target = (
-            context.make_array(signature.args[i])(context, builder, arguments[i]).data for i in (0, 2)
-        )
+        source, target = (context.make_array(signature.args[i])(context, builder, arguments[i]).data for i in (0, 2))
 
         def row(r: int):
             place = builder.add(arguments[1], ir.Constant(arguments[1].type, LANES * r))

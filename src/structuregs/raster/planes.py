@@ -6,11 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..geometry import Camera, quat_to_matrix
+from ..geometry import Camera
 from ..model import Splats
-from .render import blend, project
+from .render import blend, project, stages
 
-_STEEPEST = 0.1  # least cosine between a plane's normal and the line of sight: seen edge-on a plane is nowhere
 _LEAST = 1e-3  # of the alpha that means are taken over
 
 
@@ -33,14 +32,7 @@ def tangent_planes(splats: Splats, camera: Camera) -> Float[Tensor, "N 3"]:
 
     Planes that the camera sees nearly edge-on are turned towards it.
     """
-    T_camera_world = camera.T_world_camera.inverse().to(splats.means.device, splats.means.dtype)
-    centres = T_camera_world.apply(splats.means)
-    shortest = splats.log_scales.detach().argmin(-1)[:, None, None].expand(-1, 3, 1)
-    normals = quat_to_matrix(splats.quats).gather(2, shortest)[..., 0] @ T_camera_world.rotation.T
-    sight = torch.nn.functional.normalize(centres, dim=-1)
-    cosine = (normals * sight).sum(-1, keepdim=True)
-    normals = torch.where(cosine < 0, -normals, normals) + (_STEEPEST - cosine.abs()).clamp(min=0) * sight
-    return normals / (normals * centres).sum(-1, keepdim=True).clamp(min=1e-6)
+    return stages(splats.means).tangent_planes(splats, camera)
 
 
 def render_planes(splats: Splats, camera: Camera) -> PlaneImage:

@@ -19,7 +19,8 @@ _ONE, _TWO, _HALF = np.float32(1), np.float32(2), np.float32(0.5)
 
 
 @kernel()
-def _rotation(w, x, y, z):
+def rotation(w, x, y, z):
+    """The matrix of a unit quaternion, by rows."""
     return (
         (_ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y)),
         (_TWO * (x * y + w * z), _ONE - _TWO * (x * x + z * z), _TWO * (y * z - w * x)),
@@ -28,7 +29,7 @@ def _rotation(w, x, y, z):
 
 
 @kernel()
-def _times(W, R, j):
+def times(W, R, j):
     """Column j of the matrix product."""
     return (
         W[0, 0] * R[0][j] + W[0, 1] * R[1][j] + W[0, 2] * R[2][j],
@@ -38,7 +39,8 @@ def _times(W, R, j):
 
 
 @kernel()
-def _dot(a, b):
+def dot(a, b):
+    """The inner product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -48,13 +50,14 @@ def _cross(a, b):
 
 
 @kernel()
-def _camera_point(W, t, means, i):
+def camera_point(W, t, means, i):
+    """A splat's centre in the camera's frame."""
     p = (means[i, 0], means[i, 1], means[i, 2])
-    return _dot(W[0], p) + t[0], _dot(W[1], p) + t[1], _dot(W[2], p) + t[2]
+    return dot(W[0], p) + t[0], dot(W[1], p) + t[1], dot(W[2], p) + t[2]
 
 
 @kernel()
-def _unit_quat(quats, i):
+def unit_quat(quats, i):
     """The unit quaternion and one over the length."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     inverse = _ONE / max(np.float32(math.sqrt(w * w + x * x + y * y + z * z)), np.float32(1e-12))
@@ -69,7 +72,7 @@ def _sigmoid(x):
 @kernel()
 def _axes(W, R, scales):
     """The rows x, y, z of A = W R S."""
-    c0, c1, c2 = _times(W, R, 0), _times(W, R, 1), _times(W, R, 2)
+    c0, c1, c2 = times(W, R, 0), times(W, R, 1), times(W, R, 2)
     s0, s1, s2 = scales
     return (
         (c0[0] * s0, c1[0] * s1, c2[0] * s2),
@@ -86,9 +89,9 @@ def _image_row(f, a, u, az):
 @kernel()
 def _covariance(m_x, m_y):
     """(xx, xy, yy, determinant) of the dilated 2D covariance; the determinant as a sum of squares, which cannot cancel."""
-    xx, xy, yy = _dot(m_x, m_x), _dot(m_x, m_y), _dot(m_y, m_y)
+    xx, xy, yy = dot(m_x, m_x), dot(m_x, m_y), dot(m_y, m_y)
     normal = _cross(m_x, m_y)
-    det = _dot(normal, normal) + _DILATION * (xx + yy) + _DILATION * _DILATION
+    det = dot(normal, normal) + _DILATION * (xx + yy) + _DILATION * _DILATION
     return xx + _DILATION, xy, yy + _DILATION, det
 
 
@@ -109,7 +112,7 @@ def project_forward(means, quats, log_scales, logits, W, t, lens, size, xy, coni
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     for i in prange(len(means)):
-        x, y, z = _camera_point(W, t, means, i)
+        x, y, z = camera_point(W, t, means, i)
         o = _sigmoid(logits[i])
         opacity[i] = o
         depth[i] = z
@@ -118,8 +121,8 @@ def project_forward(means, quats, log_scales, logits, W, t, lens, size, xy, coni
         extent[i, 0], extent[i, 1] = np.float32(0), np.float32(0)
         if not (z > _NEAR and z < _HUGE and o >= _MIN_ALPHA):
             continue
-        w_, x_, y_, z_, _ = _unit_quat(quats, i)
-        a_x, a_y, a_z = _axes(W, _rotation(w_, x_, y_, z_), _scales(log_scales, i))
+        w_, x_, y_, z_, _ = unit_quat(quats, i)
+        a_x, a_y, a_z = _axes(W, rotation(w_, x_, y_, z_), _scales(log_scales, i))
         u, v = min(max(x / z, lens[4]), lens[5]), min(max(y / z, lens[6]), lens[7])
         xx, cross, yy, det = _covariance(_image_row(fx / z, a_x, u, a_z), _image_row(fy / z, a_y, v, a_z))
         px, py = fx * x / z + cx, fy * y / z + cy
@@ -134,7 +137,7 @@ def project_forward(means, quats, log_scales, logits, W, t, lens, size, xy, coni
 
 
 @kernel()
-def _quat_gradient(w, x, y, z, c0, c1, c2):
+def quat_gradient(w, x, y, z, c0, c1, c2):
     """Gradient of a unit quaternion from that of its rotation matrix, given by columns."""
     return (
         _TWO * (x * (c1[2] - c2[1]) + y * (c2[0] - c0[2]) + z * (c0[1] - c1[0])),
@@ -166,7 +169,7 @@ def _row_gradients(m_x, m_y, g_xx, g_xy, g_yy):
 
 
 @kernel()
-def _world_column(W, g_x, g_y, g_z):
+def world_column(W, g_x, g_y, g_z):
     """W^T g."""
     return (
         W[0, 0] * g_x + W[1, 0] * g_y + W[2, 0] * g_z,
@@ -178,7 +181,7 @@ def _world_column(W, g_x, g_y, g_z):
 @kernel()
 def _axis_gradient(W, f_x, f_y, u, v, g_x, g_y):
     """Gradient of a splat's axis in the world (a column of R S) from those of its entries in the image rows."""
-    return _world_column(W, f_x * g_x, f_y * g_y, -(u * f_x * g_x + v * f_y * g_y))
+    return world_column(W, f_x * g_x, f_y * g_y, -(u * f_x * g_x + v * f_y * g_y))
 
 
 @kernel()
@@ -193,13 +196,13 @@ def _centre_gradient(p, lens, m_x, m_y, a_z, g_mx, g_my, g_x, g_y, g_depth):
     f_x, f_y = lens[0] / z, lens[1] / z
     d_x, d_y = g_x * f_x, g_y * f_y
     # Both image rows go with 1 / z; u and v follow the centre only inside the limits.
-    d_z = g_depth - (d_x * x + d_y * y) / z - (_dot(m_x, g_mx) + _dot(m_y, g_my)) / z
+    d_z = g_depth - (d_x * x + d_y * y) / z - (dot(m_x, g_mx) + dot(m_y, g_my)) / z
     if lens[4] <= x / z <= lens[5]:
-        g_u = -f_x * _dot(g_mx, a_z)
+        g_u = -f_x * dot(g_mx, a_z)
         d_x += g_u / z
         d_z -= g_u * x / (z * z)
     if lens[6] <= y / z <= lens[7]:
-        g_v = -f_y * _dot(g_my, a_z)
+        g_v = -f_y * dot(g_my, a_z)
         d_y += g_v / z
         d_z -= g_v * y / (z * z)
     return d_x, d_y, d_z
@@ -216,9 +219,9 @@ def project_backward(
         if not extent[i, 0] > 0:
             d_means[i, :], d_quats[i, :], d_log_scales[i, :] = np.float32(0), np.float32(0), np.float32(0)
             continue
-        p = _camera_point(W, t, means, i)
-        qw, qx, qy, qz, inverse = _unit_quat(quats, i)
-        R, s = _rotation(qw, qx, qy, qz), _scales(log_scales, i)
+        p = camera_point(W, t, means, i)
+        qw, qx, qy, qz, inverse = unit_quat(quats, i)
+        R, s = rotation(qw, qx, qy, qz), _scales(log_scales, i)
         a_x, a_y, a_z = _axes(W, R, s)
         u, v = min(max(p[0] / p[2], lens[4]), lens[5]), min(max(p[1] / p[2], lens[6]), lens[7])
         f_x, f_y = lens[0] / p[2], lens[1] / p[2]
@@ -226,7 +229,7 @@ def project_backward(
         g_mx, g_my = _row_gradients(m_x, m_y, g_conic[i, 0], g_conic[i, 1], g_conic[i, 2])
 
         d = _centre_gradient(p, lens, m_x, m_y, a_z, g_mx, g_my, g_xy[i, 0], g_xy[i, 1], g_depth[i])
-        d_means[i, 0], d_means[i, 1], d_means[i, 2] = _world_column(W, d[0], d[1], d[2])
+        d_means[i, 0], d_means[i, 1], d_means[i, 2] = world_column(W, d[0], d[1], d[2])
 
         c0 = _scaled(_axis_gradient(W, f_x, f_y, u, v, g_mx[0], g_my[0]), s[0])
         c1 = _scaled(_axis_gradient(W, f_x, f_y, u, v, g_mx[1], g_my[1]), s[1])
@@ -235,7 +238,7 @@ def project_backward(
         d_log_scales[i, 1] = c1[0] * R[0][1] + c1[1] * R[1][1] + c1[2] * R[2][1]
         d_log_scales[i, 2] = c2[0] * R[0][2] + c2[1] * R[1][2] + c2[2] * R[2][2]
 
-        g = _quat_gradient(qw, qx, qy, qz, c0, c1, c2)
+        g = quat_gradient(qw, qx, qy, qz, c0, c1, c2)
         along = g[0] * qw + g[1] * qx + g[2] * qy + g[3] * qz
         d_quats[i, 0], d_quats[i, 1] = (g[0] - along * qw) * inverse, (g[1] - along * qx) * inverse
         d_quats[i, 2], d_quats[i, 3] = (g[2] - along * qy) * inverse, (g[3] - along * qz) * inverse

@@ -16,6 +16,8 @@ DILATION = 0.3  # px^2 on the diagonal of every 2D covariance: a splat is never 
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1 / 255  # fainter contributions are skipped
 MIN_TRANSMITTANCE = 1e-4  # a pixel takes no more splats once it lets less than this through
+STEEPEST = 0.1  # least cosine between a drawn plane's normal and the line of sight: seen edge-on a plane is nowhere
+LEAST_DISTANCE = 1e-6  # of a drawn plane from the camera; the capture's unit
 FRUSTUM_MARGIN = 0.3  # the projection is linearised at most this share of half the field of view outside the image
 
 

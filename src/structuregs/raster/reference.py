@@ -8,10 +8,12 @@ from ..geometry import Camera, quat_to_matrix
 from ..model import Splats
 from .records import (
     DILATION,
+    LEAST_DISTANCE,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_TRANSMITTANCE,
     NEAR,
+    STEEPEST,
     Projection,
     Render,
     frustum_limits,
@@ -79,3 +81,15 @@ def blend(projection: Projection, width: int, height: int, background: Float[Ten
     colour, depth, alpha = torch.stack(rows).split([3, 1, 1], -1)
     safe = torch.where(alpha > 0, alpha, torch.ones_like(alpha))
     return Render(colour + (1 - alpha) * background, alpha[..., 0], (depth / safe)[..., 0], projection)
+
+
+def tangent_planes(splats: Splats, camera: Camera) -> Float[Tensor, "N 3"]:
+    """See `planes.tangent_planes`."""
+    T_camera_world = camera.T_world_camera.inverse().to(splats.means.device, splats.means.dtype)
+    centres = T_camera_world.apply(splats.means)
+    shortest = splats.log_scales.detach().argmin(-1)[:, None, None].expand(-1, 3, 1)
+    normals = quat_to_matrix(splats.quats).gather(2, shortest)[..., 0] @ T_camera_world.rotation.T
+    sight = torch.nn.functional.normalize(centres, dim=-1)
+    cosine = (normals * sight).sum(-1, keepdim=True)
+    normals = torch.where(cosine < 0, -normals, normals) + (STEEPEST - cosine.abs()).clamp(min=0) * sight
+    return normals / (normals * centres).sum(-1, keepdim=True).clamp(min=LEAST_DISTANCE)

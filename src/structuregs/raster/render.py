@@ -40,16 +40,17 @@ def render(
     return _module(backend).render(splats, camera, background=background)
 
 
-def _stages(tensor: Tensor):
+def stages(tensor: Tensor):
+    """The back end for a tensor like this, as a module."""
     fast = tensor.device.type if tensor.dtype == torch.float32 else ""
     return _module(fast if fast in ("cpu", "cuda") else "reference")
 
 
 def project(splats: Splats, camera: Camera) -> Projection:
     """The first stage of `render`: splats in the world to 2D Gaussians on the image."""
-    return _stages(splats.means).project(splats, camera)
+    return stages(splats.means).project(splats, camera)
 
 
 def blend(projection: Projection, width: int, height: int, background: Float[Tensor, " 3"]) -> Render:
     """The second stage of `render`: 2D Gaussians to an image, blended from near to far."""
-    return _stages(projection.xy).blend(projection, width, height, background)
+    return stages(projection.xy).blend(projection, width, height, background)
