@@ -18,7 +18,7 @@ test: install $(ORACLES)
 	$(BIN)/pytest
 
 bench: install
-	$(BIN)/python benchmarks/raster.py
+	$(BIN)/python benchmarks/speed.py --against benchmarks/baseline.json
 
 install: $(INSTALLED)
 

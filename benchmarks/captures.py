@@ -1,6 +1,7 @@
 """Fits and evaluates captures, and writes what came of it as a table.
 
-    python benchmarks/captures.py CAPTURE... -o RUNS [--preset default] [--seeds 0 1 2] [--views N] [--jobs 1] [--table FILE]
+    python benchmarks/captures.py CAPTURE... -o RUNS [--preset default] [--seeds 0 1 2] [--views N] [--device auto]
+        [--jobs 1] [--table FILE]
 
 Every fit is `structuregs fit` in a process of its own, one after the other or `--jobs` at a time (each then with its share
 of the cores), and its run is kept in RUNS: what is finished is not done again.  The table has a row for each joint, the
@@ -17,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-STRUCTUREGS = str(Path(sys.executable).with_name("structuregs"))
+STRUCTUREGS = (sys.executable, "-c", "from structuregs.cli import main; main()")
 HEAD = (
     *("capture", "joint", "axis deg", "position", "turn deg", "slide", "PSNR"),
     *("CD static", "CD movable", "CD whole", "seconds", "peak GB"),
@@ -34,6 +35,7 @@ class Job:
     views: int | None
     runs: Path
     threads: int
+    device: str
 
     @property
     def run(self) -> Path:
@@ -51,7 +53,8 @@ class Job:
         if self.report.exists():
             return
         threads = {"OMP_NUM_THREADS": str(self.threads), "NUMBA_NUM_THREADS": str(self.threads)}
-        options = ["--preset", self.preset, "--seed", str(self.seed), *(["--views", str(self.views)] if self.views else [])]
+        options = ["--preset", self.preset, "--seed", str(self.seed), "--device", self.device]
+        options += ["--views", str(self.views)] if self.views else []
         peak = self._call("fit", str(self.capture), "-o", str(self.run), *options, threads=threads)
         staged = self.report.with_suffix(".part")
         self._call("eval", str(self.run), "--protocol", "paris", "--json", str(staged), threads=threads)
@@ -63,7 +66,7 @@ class Job:
     def _call(self, *words: str, threads: dict[str, str]) -> float:
         """Runs a command, its output in a log beside the run; the most memory that it held, GB."""
         with self.run.with_suffix(".log").open("a") as log:
-            process = subprocess.Popen([STRUCTUREGS, *words], env=os.environ | threads, stdout=log, stderr=log)
+            process = subprocess.Popen([*STRUCTUREGS, *words], env=os.environ | threads, stdout=log, stderr=log)
             _, status, usage = os.wait4(process.pid, 0)
             process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
@@ -115,13 +118,14 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--views", type=int)
+    parser.add_argument("--device", default="auto")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--table", type=Path, help="write the table here too, for the repository")
     given = parser.parse_args()
     given.runs.mkdir(parents=True, exist_ok=True)
     threads = max(1, (os.cpu_count() or 1) // given.jobs)
     jobs = [
-        Job(capture.resolve(), given.preset, seed, given.views, given.runs, threads)
+        Job(capture.resolve(), given.preset, seed, given.views, given.runs, threads, given.device)
         for seed in given.seeds
         for capture in given.captures
     ]

@@ -7,6 +7,7 @@ import torch
 from structuregs.geometry import SE3, Box
 from structuregs.joints import articulate
 from structuregs.model import SH_C0, ArticulatedObject, Joint, PosedParts, Splats, load_object, save_object
+from structuregs.model.place import placed
 from structuregs.model.sh import rotate_sh, sh_basis
 
 
@@ -61,6 +62,22 @@ def test_turned_harmonics_have_the_colours_of_directions_turned_back(degree):
     turned = torch.einsum("dc,nck->ndk", sh_basis(directions(), degree), rotate_sh(sh, R))
     expected = torch.einsum("dc,nck->ndk", sh_basis(directions() @ R, degree), sh)
     assert torch.allclose(turned, expected, atol=1e-10)
+
+
+def test_the_kernel_that_poses_splats_is_plain_torch_in_value_and_every_gradient():
+    g = generator(4)
+    counts = (3000, 1, 1500)  # more than a block, one splat, and part of a block
+    shapes = ((4501, 3), (4501, 4), (3, 3, 3), (3, 7))
+    inputs = [torch.randn(shape, generator=g, dtype=torch.float64) for shape in shapes]
+    weights = [torch.randn(shape, generator=g, dtype=torch.float64) for shape in shapes[:2]]
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [value.to(dtype).clone().requires_grad_() for value in inputs]
+        outputs = placed(leaves[0], leaves[1], counts, leaves[2], SE3(leaves[3]))
+        sum((o * w.to(dtype)).sum() for o, w in zip(outputs, weights, strict=True)).backward()
+        found.append([*(o.detach() for o in outputs), *(leaf.grad for leaf in leaves)])
+    for fast, exact in zip(*found, strict=True):
+        torch.testing.assert_close(fast.double(), exact, rtol=1e-5, atol=1e-5 * float(exact.abs().max()))
 
 
 @pytest.mark.parametrize("degree", [0, 2])

@@ -11,6 +11,7 @@ from ..raster import Projection
 from .schedule import Growth
 from .variables import SPLAT_NAMES, Variables, part_index
 
+_CELLS = 256  # along each side of a box, in which splats are put in order
 _SHRINK = 1.6  # the halves of a split splat are this much smaller (Kerbl et al. 2023)
 
 
@@ -64,6 +65,19 @@ def prune_mask(variables: Variables, growth: Growth) -> Bool[Tensor, " N"]:
     return opaque & (variables.leaves["means"].abs() < 1 + growth.outside).all(-1)
 
 
+def _along_curve(means: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
+    """Places of canonical points on a Z-order curve (Morton 1966): neighbours in space become neighbours in memory.
+
+    What an image tile draws then lies together; in no order at all, drawing it takes up to twice as long.
+    """
+    cells = ((means.clamp(-1, 1) + 1) / 2 * (_CELLS - 1)).long()
+    place = torch.zeros(len(means), dtype=torch.long, device=means.device)
+    for bit in range(_CELLS.bit_length() - 1):
+        for axis in range(3):
+            place |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return place
+
+
 @torch.no_grad()
 def grow(
     variables: Variables, gradients: ScreenGradients | None, growth: Growth, size: float, generator: torch.Generator
@@ -78,7 +92,8 @@ def grow(
         generator: for the places of the halves.
 
     Returns:
-        Variables after; for each of their splats the index of the splat it was or came from; and whether it is new.
+        Variables after, each part's splats in the order of a curve through its box; for each splat the index of the one it
+        was or came from; and whether it is new.
     """
     count = sum(variables.counts)
     keep = prune_mask(variables, growth)
@@ -99,10 +114,10 @@ def grow(
     fresh = torch.zeros(len(source), dtype=torch.bool, device=device)
     fresh[int((keep & ~split).sum()) :] = True
     part = part_index(variables.counts, device)
-    order = torch.argsort(part[source], stable=True)
     leaves = {name: variables.leaves[name][source] for name in SPLAT_NAMES}
     if len(halves):
         leaves["means"][-len(halves) :], leaves["log_scales"][-len(halves) :] = _moved_within(variables, halves, generator)
+    order = torch.argsort(part[source] * _CELLS**3 + _along_curve(leaves["means"]), stable=True)
     leaves = {name: value[order].requires_grad_() for name, value in leaves.items()}
     counts = tuple(int(n) for n in torch.bincount(part[source], minlength=len(variables.counts)))
     grown = Variables(variables.leaves | leaves, counts, variables.kinds, variables.start, variables.centres)

@@ -18,8 +18,9 @@ from ..model import PosedParts, Splats
 from ..raster import image_loss, render
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
+from .merge import idle_part, moving_alike
 from .schedule import FitConfig
-from .structure import StructureWeights, contact_loss, structure_loss
+from .structure import StructureWeights, structure_loss
 from .surface import planarity_loss, thickness
 from .variables import SPLAT_NAMES, Variables
 
@@ -127,7 +128,7 @@ class Fitter:
         """Takes steps until `steps` are done; yields a `Step` now and then."""
         while self.state.step < min(steps, self.config.steps):
             if self.state.step == round(self.config.join_at * self.config.steps):
-                yield from self._join_parts()
+                yield from self._merge_parts()
             yield from self._settle_joints()
             loss, psnr = self._step()
             self._densify()
@@ -135,17 +136,21 @@ class Fitter:
             if self.state.step % _REPORT_EVERY == 0:
                 yield Step("fit", self.state.step, loss, psnr, sum(self.state.variables.counts))
 
-    def _join_parts(self) -> Iterator[FitEvent]:
-        """Makes one part of two that touch and have come to move alike; a thing found in two pieces is one after all."""
+    def _merge_parts(self) -> Iterator[FitEvent]:
+        """Makes one part of two that touch and move alike, and leaves to the base what need not move."""
+        step = self.state.step
         while True:
             with torch.no_grad():
                 parts = self.state.variables.parts().detach()
-            pair = moving_alike(parts)
+            pair, idle = moving_alike(parts), None
             if pair is None:
-                return
-            step = self.state.step
+                idle = idle_part(parts, self._images()[1])
+                if idle is None:
+                    return
+                pair = (0, idle)
             self.state = replace(FitState.start(parts.joined(*pair)), size=self.state.size, step=step)
-            yield Note(f"two parts that move alike are one from step {step} on; {len(parts) - 2} left")
+            what = "a part that need not move is the base's" if idle else "two parts that move alike are one"
+            yield Note(f"{what} from step {step} on; {len(parts) - 2} left")
 
     def _settle_joints(self) -> Iterator[FitEvent]:
         """Holds every motion to one degree of freedom once its time has come."""
@@ -307,17 +312,3 @@ def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
             direction = torch.nn.functional.normalize(parts.motions.xyz[k], dim=0)
             total = total + (1 - (axes @ direction).square().max()).clamp(max=_SQUARE_WITHIN)
     return total
-
-
-def moving_alike(parts: PosedParts) -> tuple[int, int] | None:
-    """Two moving parts that touch and whose motions agree to a twentieth of their travel, the larger first; or None."""
-    for a in range(1, len(parts)):
-        for b in range(a + 1, len(parts)):
-            corners = torch.cat([parts.boxes.corners[a], parts.boxes.corners[b]])
-            ways = [parts.motions[k].apply(corners) - corners for k in (a, b)]
-            apart = (ways[0] - ways[1]).norm(dim=-1).mean()
-            travel = torch.minimum(ways[0].norm(dim=-1).mean(), ways[1].norm(dim=-1).mean())
-            gap = contact_loss(parts.boxes[[a, b]])
-            if apart < 0.05 * travel and gap < 0.05 * parts.boxes.half_extents[[a, b]].norm(dim=-1).amax():
-                return (a, b) if parts.counts[a] >= parts.counts[b] else (b, a)
-    return None

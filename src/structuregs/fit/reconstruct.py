@@ -220,7 +220,7 @@ def fit_run(
         run: folder of the run; made if it is not there.
         config: the whole configuration.
         device: "auto", "cpu" or "cuda".
-        parts: number of moving parts; estimated if None.
+        parts: number of moving parts, of which then none is merged with another; estimated if None.
         points: where first points come from: "hull", "depth" or a file.
         seed: of all randomness; the same seed gives the same bytes on a CPU.
 
@@ -228,6 +228,7 @@ def fit_run(
         ValueError: the folder holds another run, or a damaged one.
     """
     chosen, folder = choose_device(device), RunFolder(run)
+    config = config if parts is None else replace(config, join_at=1.0)
     views = [len(state) for state in capture.train]
     record = {"capture": str(capture.root.resolve()), "views": views, "seed": seed, "parts": parts, "points": points}
     folder.begin(record | {"fit": asdict(config)})

@@ -100,7 +100,8 @@ class FitConfig:
     slide_along_base: float = 1.0
     """Of the squared sine of the angle between a slide and the nearest axis of the base's box, once joints are held."""
     join_at: float = 0.35
-    """Part of the fit after which parts that touch and move alike are made one."""
+    """Part of the fit after which parts that touch and move alike are made one, and what need not move is left to the base;
+    1 for never."""
     one_joint_from: float = 0.6
     """Part of the fit after which every motion is held to its joint's one degree of freedom; 1 for never."""
     checkpoint_every: int = 250
@@ -137,11 +138,12 @@ PRESETS: dict[str, FitConfig] = {
         thickness_penalty=0.0,
         planarity_weight=0.0,
         slide_along_base=0.0,
+        join_at=1.0,
         one_joint_from=1.0,
         checkpoint_every=500,
         rates=Rates(
             quats=1e-3, log_scales=5e-3, sh=2.5e-3, tint=0.0, boxes=1e-2, motions=1e-2, final=1.0, appearance_final=1.0
         ),
-        growth=Growth(first=0.05, last=0.5, reset=3000),
+        growth=Growth(first=0.05, last=0.5, reset=3000, most=100_000),
     ),
 }

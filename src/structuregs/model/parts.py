@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..geometry import SE3, Box, quat_multiply
+from .place import placed
 from .sh import rotate_sh
 from .splats import SH_C0, Splats
 
@@ -52,21 +53,17 @@ class PosedParts:
 
     def place(self, boxes: Box, shade: float) -> Splats:
         """All splats in the world, with every part's box where `boxes` says and `shade` times the tint."""
-        means, quats, sh = [], [], []
         colours = self.splats.sh
         if shade:
             constant = colours[:, :1] + (shade / SH_C0) * self.tint[:, None]
             colours = constant if colours.shape[1] == 1 else torch.cat([constant, colours[:, 1:]], 1)
-        rows = zip(
-            self.splats.means.split(self.counts), self.splats.quats.split(self.counts), colours.split(self.counts), strict=True
-        )
         rotations = boxes.T_world_box.rotation
-        for k, (mean, quat, colour) in enumerate(rows):
-            pose, R = boxes.T_world_box[k], rotations[k]
-            means.append(torch.addmm(pose.xyz, mean, (R * boxes.half_extents[k]).T))
-            quats.append(quat_multiply(pose.wxyz, quat))
-            sh.append(rotate_sh(colour, R))
-        return replace(self.splats, means=torch.cat(means), quats=torch.cat(quats), sh=torch.cat(sh))
+        if colours.shape[1] > 1:
+            rows = zip(colours.split(self.counts), rotations, strict=True)
+            colours = torch.cat([rotate_sh(colour, R) for colour, R in rows])
+        matrices = rotations * boxes.half_extents[:, None]
+        means, quats = placed(self.splats.means, self.splats.quats, self.counts, matrices, boxes.T_world_box)
+        return replace(self.splats, means=means, quats=quats, sh=colours)
 
     def detach(self) -> "PosedParts":
         """The same values without a gradient's history."""
