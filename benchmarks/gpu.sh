@@ -5,7 +5,7 @@
 #
 # Needs an NVIDIA GPU, nvcc, and a python (PYTHON, else the one of .venv, else python3) with torch for CUDA, gsplat 1.5.3
 # and the package's other dependencies.  Writes to OUT: the tests' output, the figures of speed.py, and for captures the
-# runs and a table for the presets "paper" and "default".
+# runs and tables of the presets "paper" and "default".
 set -eu
 cd "$(dirname "$0")/.."
 [ $# -ge 1 ] || { echo "usage: benchmarks/gpu.sh OUT [CAPTURE...]" >&2; exit 2; }
@@ -32,5 +32,5 @@ export CUDA_HOME TORCH_CUDA_ARCH_LIST MAX_JOBS CPATH="${CPATH:-}" PYTHONPATH="sr
 grep -q passed "$out/tests.txt" && ! grep -q failed "$out/tests.txt" || exit 1
 "$PYTHON" benchmarks/speed.py --sections growth --device cuda --json "$out/cuda.json" | tee "$out/speed.txt"
 [ $# -eq 0 ] || for preset in paper default; do
-    "$PYTHON" benchmarks/captures.py "$@" -o "$out/runs" --preset $preset --seeds 0 --device cuda --table "$out/$preset.md"
+    "$PYTHON" -c 'from structuregs.cli import main; main()' bench "$@" -o "$out/$preset" --preset $preset --seeds 0 --device cuda
 done

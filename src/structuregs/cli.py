@@ -1,4 +1,4 @@
-"""The command line: `structuregs fit | eval | render | export | view | demo`."""
+"""The command line: `structuregs fit | eval | render | export | view | bench | demo`."""
 
 import math
 import os
@@ -150,6 +150,66 @@ def view(run: RunFolder, port: int = 0) -> None:
 
     obj = load_object(run / "object")
     serve(obj, title=run.resolve().name, port=port, ready=lambda url: print(f"look at {url} (Ctrl-C ends)", flush=True))
+
+
+def bench(
+    captures: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FOLDER|LIST")],
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")],
+    views: str = "all",
+    seeds: str = "0,1,2",
+    preset: Preset = "default",
+    protocol: Literal["paris", "artgs", "strict"] = "paris",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    at_once: int = 1,
+) -> None:
+    """Fit and score many captures, and write tables beside the published figures; run it again to go on.
+
+    Args:
+        captures: Folders of captures or above them, or files that list such folders, one a line.
+        output: Folder of the runs and of table.md, table.csv and table.json.
+        views: Numbers of views of each state to fit with, with commas between; all: every view.
+        seeds: Seeds to fit with, with commas between.
+        preset: As `fit` takes it.
+        protocol: As `eval` takes it.
+        device: Where to compute.
+        at_once: Fits at a time; the cores are shared out between them.
+    """
+    from .capture import find_captures
+    from .evaluate import Bench, write_tables
+    from .evaluate import bench as run_bench
+
+    if not captures:
+        raise ValueError("nothing to fit; give folders of captures, or files that list them.")
+    if at_once < 1:
+        raise ValueError(f"--at-once {at_once}: give 1 or more.")
+    found = tuple(dict.fromkeys(folder.resolve() for path in captures for folder in find_captures(path)))
+    wanted = tuple(None if word == "all" else _number(word, "--views") for word in _words(views, "--views"))
+    numbers = tuple(_number(word, "--seeds") for word in _words(seeds, "--seeds"))
+    plan = Bench(found, output, wanted, numbers, preset, protocol, device, at_once)
+    rows = []
+    with _bars() as progress:
+        task = progress.add_task("bench", total=len(found) * len(wanted) * len(numbers), figures="")
+        for row in run_bench(plan):
+            rows.append(row)
+            failures = row.error or f"{row.report['failures'] if row.report else 0} joints failed"
+            count = "all" if row.views is None else row.views
+            progress.console.print(f"{row.capture.name}, {count} views, seed {row.seed}: {failures}", soft_wrap=True)
+            progress.update(task, advance=1, figures=row.capture.name)
+            files = write_tables(plan, rows)
+    print(f"wrote {', '.join(str(file) for file in files)}")
+
+
+def _words(text: str, option: str) -> list[str]:
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    if not words:
+        raise ValueError(f"{option}: nothing is given; write values with commas between.")
+    return words
+
+
+def _number(word: str, option: str) -> int:
+    if not word.isdigit():
+        raise ValueError(f"{option} {word}: not a whole number.")
+    return int(word)
 
 
 def demo(run: NewRun = Path("runs/demo")) -> None:
@@ -343,7 +403,7 @@ def main() -> None:
     """Runs the command line; a user's error is one sentence and exit code 2 (`STRUCTUREGS_DEBUG=1` shows the traceback)."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"fit": fit, "eval": evaluate, "render": render, "view": view, "export": export, "demo": demo},
+            {"fit": fit, "eval": evaluate, "render": render, "view": view, "export": export, "bench": bench, "demo": demo},
             prog="structuregs",
             description="Photos of an articulated object in two states go in; a working digital twin comes out.",
         )

@@ -2,7 +2,7 @@
 
 from .capture import Capture, View
 from .errors import CaptureError
-from .layouts import Layout
+from .layouts import Layout, find_captures
 from .read import farthest_points, load_capture
 from .stack import ImageStack, stack_views
 from .truth import TrueJoint, Truth, find_truth, load_truth
@@ -18,6 +18,7 @@ __all__ = [
     "Truth",
     "View",
     "farthest_points",
+    "find_captures",
     "find_truth",
     "load_capture",
     "load_truth",

@@ -98,6 +98,28 @@ def find_layout(path: Path) -> tuple[Path, Layout]:
     )
 
 
+def find_captures(path: Path) -> list[Path]:
+    """The folders of all captures at or below a folder, or those that a text file lists, one a line.
+
+    Lines are relative to the file's folder; empty ones and those that begin with # do not count.
+
+    Raises:
+        CaptureError: there is no such file or folder, or no capture in it.
+    """
+    if path.is_file():
+        lines = [line.strip() for line in path.read_text().splitlines()]
+        found = [find_layout(path.parent / line)[0] for line in lines if line and not line.startswith("#")]
+        if not found:
+            raise CaptureError(f"{path}: the list names no capture; write the folder of one in each line.")
+        return found
+    if not path.is_dir():
+        raise CaptureError(f"{path}: there is no such folder or list; give a folder that holds captures.")
+    found = sorted({p for depth in range(_DEPTH_BELOW + 1) for p in _captures_at(path, depth)})
+    if not found:
+        find_layout(path)  # says what was expected
+    return found
+
+
 def _captures_at(path: Path, depth: int) -> set[Path]:
     """Folders `depth` levels below that hold a camera file of state 0."""
     up = "*/" * depth

@@ -1,5 +1,6 @@
 """A run or an object against ground truth."""
 
+from .bench import Bench, BenchRow, bench
 from .matching import match_joints
 from .report import (
     PROTOCOLS,
@@ -13,15 +14,19 @@ from .report import (
 )
 from .scores import JointScore, score_joints
 from .surfaces import SURFACE_PROTOCOLS, SurfaceProtocol, SurfaceScore, score_surfaces
+from .tables import write_tables
 
 __all__ = [
     "PROTOCOLS",
     "SURFACE_PROTOCOLS",
+    "Bench",
+    "BenchRow",
     "JointScore",
     "Protocol",
     "Report",
     "SurfaceProtocol",
     "SurfaceScore",
+    "bench",
     "capture_of_run",
     "evaluate_object",
     "evaluate_run",
@@ -30,4 +35,5 @@ __all__ = [
     "score_surfaces",
     "training_capture",
     "write_report",
+    "write_tables",
 ]
