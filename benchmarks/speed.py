@@ -129,7 +129,7 @@ def stages(operations: float, moved: float) -> list[tuple[str, float, float]]:
         ),
         (
             "sum of the tiles' gradients",
-            measured(filling(bk.sum_partials, starts, ends, lists, partials, p["conic"], p["opacity"])),
+            measured(filling(bk.sum_partials, starts, ends, lists, partials, p["conic"], p["opacity"], threads)),
             stream,
             4.0 * (pairs * (bk.PARTIALS + 1) + count * 2 * bk.PARTIALS),
         ),

@@ -29,7 +29,7 @@ _POSITIVE = 0x7FFFFFFF  # masks an index, so that the compiler need not think of
 _CHECK = 16  # splats between two looks at whether a tile is full
 
 
-@kernel()
+@kernel(parallel=True)
 def pack(xy, conic, opacity, rgb, depth, extent):
     """The blend's own tables of the splats, one cache line and half of one for each.
 
@@ -42,7 +42,7 @@ def pack(xy, conic, opacity, rgb, depth, extent):
         reach: (N 8) centre and extents; then for u = y: turn, slope, level, bend.
     """
     drawing, reach = np.empty((len(xy), 16), np.float32), np.empty((len(xy), 8), np.float32)
-    for i in range(len(xy)):
+    for i in prange(len(xy)):
         a, b, c, o = conic[i, 0], conic[i, 1], conic[i, 2], opacity[i]
         ex, ey = extent[i, 0], extent[i, 1]
         limit = _TWO * np.float32(math.log(max(o / _MIN_ALPHA, _ONE)))
@@ -90,11 +90,10 @@ def _tile_columns(r, row, last):
 
 
 @kernel()
-def _tile_rows(r, first, past):
-    """First and one past the last row of tiles that a splat reaches, within [first, past)."""
-    low = max(r[1] - r[3], np.float32(first * TILE))
-    high = min(r[1] + r[3], np.float32(past * TILE - 1))
-    if not low <= high:
+def _tile_rows(r, down):
+    """First and one past the last of `down` rows of tiles that a splat reaches; none where it is not drawn."""
+    low, high = max(r[1] - r[3], _ZERO), min(r[1] + r[3], np.float32(down * TILE - 1))
+    if not (low <= high and r[3] > _ZERO):
         return 0, 0
     return _ceil(low) // TILE, np.int32(high) // TILE + 1
 
@@ -128,49 +127,49 @@ def depth_order(depth, extent):
 
 @kernel(parallel=True)
 def tile_lists(reach, order, width, height, lanes):
-    """Which splats each tile draws, from near to far; lanes: threads, each of which takes a band of tile rows.
+    """Which splats each tile draws, from near to far; lanes: threads.
+
+    All but the last round takes the splats as they lie in memory: only then is order asked for.
 
     Returns:
         starts: where each tile's list begins in `splats`, and the total (tiles + 1).
         splats: the lists, one after the other.
     """
     across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    rows = np.zeros(lanes + 1, np.int64)
+    count, last = len(reach), np.float32(width - 1)
+    rows = np.empty((count, 3), np.int32)  # first row of tiles, one past the last, and where the splat's spans begin
+    total = 0
+    for i in range(count):
+        y0, y1 = _tile_rows(reach[i], down)
+        rows[i, 0], rows[i, 1], rows[i, 2] = y0, y1, total
+        total += y1 - y0
+    spans = np.empty((total, 2), np.int32)  # first column of tiles, one past the last
     for lane in prange(lanes):
-        total = 0
-        for q in range(len(order)):
-            y0, y1 = _tile_rows(reach[order[q]], down * lane // lanes, down * (lane + 1) // lanes)
-            total += y1 - y0
-        rows[lane + 1] = total
-    for lane in range(lanes):
-        rows[lane + 1] += rows[lane]
-    # What a splat reaches of a row of tiles costs two roots: kept for the second round.
-    columns = np.empty((rows[-1], 2), np.int32)
+        for i in range(count * lane // lanes, count * (lane + 1) // lanes):
+            for y in range(rows[i, 0], rows[i, 1]):
+                x0, x1 = _tile_columns(reach[i], y, last)
+                span = spans[rows[i, 2] + y - rows[i, 0]]
+                span[0], span[1] = x0, x1
     heads = np.zeros(across * down + 1, np.int64)
-    last = np.float32(width - 1)
-    for lane in prange(lanes):
-        row = rows[lane]
-        for q in range(len(order)):
-            r = reach[order[q]]
-            y0, y1 = _tile_rows(r, down * lane // lanes, down * (lane + 1) // lanes)
-            for y in range(y0, y1):
-                x0, x1 = _tile_columns(r, y, last)
-                columns[row, 0], columns[row, 1] = x0, x1
-                row += 1
-                for x in range(x0, x1):
+    for lane in prange(lanes):  # a band of rows each
+        first, past = down * lane // lanes, down * (lane + 1) // lanes
+        for i in range(count):
+            for y in range(max(rows[i, 0], first), min(rows[i, 1], past)):
+                span = spans[rows[i, 2] + y - rows[i, 0]]
+                for x in range(span[0], span[1]):
                     heads[y * across + x + 1] += 1
     for tile in range(across * down):
         heads[tile + 1] += heads[tile]
     starts, splats = heads.copy(), np.empty(heads[-1], np.int32)
     for lane in prange(lanes):
-        row = rows[lane]
+        first, past = down * lane // lanes, down * (lane + 1) // lanes
         for q in range(len(order)):
-            y0, y1 = _tile_rows(reach[order[q]], down * lane // lanes, down * (lane + 1) // lanes)
-            for y in range(y0, y1):
-                for x in range(columns[row, 0], columns[row, 1]):
-                    splats[heads[y * across + x]] = order[q]
+            i = order[q]
+            for y in range(max(rows[i, 0], first), min(rows[i, 1], past)):
+                span = spans[rows[i, 2] + y - rows[i, 0]]
+                for x in range(span[0], span[1]):
+                    splats[heads[y * across + x]] = i
                     heads[y * across + x] += 1
-                row += 1
     return starts, splats
 
 
@@ -192,6 +191,19 @@ def _planes(count):
     """
     memory = np.zeros((count * TILE + 1) * TILE, np.float32)
     return memory, (-(memory.ctypes.data // 4)) & 15
+
+
+@kernel()
+def _live_rows(M, base):
+    """First and one past the last row of a tile in which a pixel still takes splats."""
+    first, past = TILE, 0
+    for y in range(TILE):
+        most = _ZERO
+        for x in range(TILE):
+            most = max(most, M[base + (y & 15) * TILE + x])
+        if most > _MIN_T:
+            first, past = min(first, y), y + 1
+    return first, past
 
 
 @kernel(parallel=True)
@@ -218,6 +230,7 @@ def _blend_tile(tile, starts, splats, drawing, background, across, image, alpha,
         for x in range(w):
             M[base + y * TILE + x] = _ONE
     k, end = starts[tile], starts[tile + 1]
+    top, bottom = 0, h
     while k < end:
         s = drawing[splats[k]]
         k += 1
@@ -225,7 +238,7 @@ def _blend_tile(tile, starts, splats, drawing, background, across, image, alpha,
         r, g, bl, z = s[6], s[7], s[8], s[9]
         b, c, peak = s[3], s[4], s[5]
         first, last = _pixel_rows(s, -gx, -gy)
-        for y in range(first, last):
+        for y in range(max(first, top), min(last, bottom)):
             row = base + (y & 15) * TILE
             dy = gy - np.float32(np.int32(y))
             constant, linear = peak + c * dy * dy, b * dy
@@ -243,10 +256,8 @@ def _blend_tile(tile, starts, splats, drawing, background, across, image, alpha,
                 M[j + _D] += wt * z
                 M[j] = t - wt
         if k % _CHECK == 0:
-            live = np.int32(0)
-            for j in range(base, base + TILE * TILE):
-                live += np.int32(1) if M[j] > _MIN_T else np.int32(0)
-            if live == 0:
+            top, bottom = _live_rows(M, base)
+            if top >= bottom:
                 break
     ends[tile] = k
     for y in range(h):
@@ -291,7 +302,10 @@ def _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, dep
                 M[m + _D] = g_depth[i, j] / alpha[i, j]
                 rest += depth[i, j] * M[m + _D]
             M[m + _S] = rest
+    top, bottom = 0, TILE
     for k in range(starts[tile], ends[tile]):
+        if k % _CHECK == 0:
+            top, bottom = _live_rows(M, base)
         s = drawing[splats[k]]
         gx, gy, a = s[0] - np.float32(x0), s[1] - np.float32(y0), s[2]
         r, g, bl, z = s[6], s[7], s[8], s[9]
@@ -299,7 +313,7 @@ def _unblend_tile(tile, starts, splats, drawing, ends, across, image, alpha, dep
         b, c, peak = s[3], s[4], s[5]
         for j in range(sums, sums + 7 * TILE):
             M[j] = _ZERO
-        for y in range(first, last):
+        for y in range(max(first, top), min(last, bottom)):
             row = base + (y & 15) * TILE
             dy = gy - np.float32(np.int32(y))
             constant, linear = peak + c * dy * dy, b * dy
@@ -343,21 +357,28 @@ def _write_partials(M, sums, gx, out):
     out[4] = middle * gy1 - out[4]
 
 
-@kernel()
-def sum_partials(starts, ends, splats, partials, conic, opacity):
-    """Gradients of xy (N 2), conic (N 3), opacity (N), rgb (N 3), depth (N), summed tile after tile: always in one order."""
+@kernel(parallel=True)
+def sum_partials(starts, ends, splats, partials, conic, opacity, lanes):
+    """Gradients of xy (N 2), conic (N 3), opacity (N), rgb (N 3), depth (N), summed tile after tile: always in one order.
+
+    lanes: threads, each of which sums for splats of its own.
+    """
     n = len(conic)
     totals = np.zeros((n, PARTIALS), np.float32)
-    for tile in range(len(ends)):
-        for k in range(starts[tile], ends[tile]):
-            for j in range(PARTIALS):
-                totals[splats[k], j] += partials[k, j]
     g_xy, g_conic, g_opacity = np.empty((n, 2), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32)
     g_rgb, g_depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
-    for i in range(n):
-        t = totals[i]
-        g_opacity[i] = -t[0] / max(opacity[i], _TINY)
-        g_xy[i, 0], g_xy[i, 1] = conic[i, 0] * t[1] + conic[i, 1] * t[2], conic[i, 1] * t[1] + conic[i, 2] * t[2]
-        g_conic[i, 0], g_conic[i, 1], g_conic[i, 2] = _HALF * t[3], t[4], _HALF * t[5]
-        g_rgb[i, 0], g_rgb[i, 1], g_rgb[i, 2], g_depth[i] = t[6], t[7], t[8], t[9]
+    for lane in prange(lanes):
+        first, past = n * lane // lanes, n * (lane + 1) // lanes
+        for tile in range(len(ends)):
+            for k in range(starts[tile], ends[tile]):
+                i = splats[k]
+                if first <= i < past:
+                    for j in range(PARTIALS):
+                        totals[i, j] += partials[k, j]
+        for i in range(first, past):
+            t = totals[i]
+            g_opacity[i] = -t[0] / max(opacity[i], _TINY)
+            g_xy[i, 0], g_xy[i, 1] = conic[i, 0] * t[1] + conic[i, 1] * t[2], conic[i, 1] * t[1] + conic[i, 2] * t[2]
+            g_conic[i, 0], g_conic[i, 1], g_conic[i, 2] = _HALF * t[3], t[4], _HALF * t[5]
+            g_rgb[i, 0], g_rgb[i, 1], g_rgb[i, 2], g_depth[i] = t[6], t[7], t[8], t[9]
     return g_xy, g_conic, g_opacity, g_rgb, g_depth

@@ -120,10 +120,10 @@ class _Blend(torch.autograd.Function):
     def forward(ctx, xy, conic, depth, rgb, opacity, extent, background, size):
         height, width = size
         z, reached = _array(depth), _array(extent)
-        drawing, reach = bk.pack(_array(xy), _array(conic), _array(opacity), _array(rgb), z, reached)
         order = bk.depth_order(z, reached)
         drawn = [np.empty(shape, np.float32) for shape in ((*size, 3), size, size)]
         with lanes() as threads:
+            drawing, reach = bk.pack(_array(xy), _array(conic), _array(opacity), _array(rgb), z, reached)
             starts, splats = bk.tile_lists(reach, order, width, height, threads)
             ends = np.empty(len(starts) - 1, np.int64)
             bk.blend_forward(starts, splats, drawing, _array(background), threads, *drawn, ends)
@@ -144,7 +144,8 @@ class _Blend(torch.autograd.Function):
         partials = np.empty((len(splats), bk.PARTIALS), np.float32)
         with lanes() as threads:
             bk.blend_backward(starts, splats, ctx.drawing, ends, threads, *drawn, g_image, g_alpha, g_depth, partials)
-        g_xy, g_conic, g_opacity, g_rgb, g_z = _tensors(bk.sum_partials(starts, ends, splats, partials, conic, opacity))
+            sums = bk.sum_partials(starts, ends, splats, partials, conic, opacity, threads)
+        g_xy, g_conic, g_opacity, g_rgb, g_z = _tensors(sums)
         g_background = None
         if ctx.needs_input_grad[6]:
             through = 1 - torch.from_numpy(drawn[1])
