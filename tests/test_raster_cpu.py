@@ -144,6 +144,23 @@ def test_kernels_compiled_just_now_and_from_the_cache_give_the_same_bytes(tmp_pa
     assert compiled == loaded
 
 
+def test_compiling_is_told_once_and_loading_from_the_cache_not_at_all(tmp_path: Path):
+    program = """
+import numpy as np
+from structuregs.jit import when_compiling
+from structuregs.raster.blend_kernels import depth_order
+said = []
+with when_compiling(lambda: said.append(1)):
+    for dtype in (np.float32, np.float64):
+        depth_order(np.ones(3, dtype), np.ones((3, 2), dtype))
+print(len(said))
+"""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    run = [sys.executable, "-c", program]
+    said = [subprocess.run(run, env=environment, check=True, capture_output=True, text=True).stdout.strip() for _ in range(2)]
+    assert said == ["1", "0"]
+
+
 def test_splats_that_are_not_finite_leave_no_trace():
     good, camera = make_splats(20), make_camera(40, 30)
     bad = make_splats(6, seed=9)

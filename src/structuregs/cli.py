@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Packages that cost a second or more to import are imported in the commands: `--help` must not wait for them.
 
+_COMPILING = "compiling for this processor, once and for all: this first run takes a minute longer"
+
 Preset = Literal["fast", "default", "paper"]
 CaptureFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")]
 RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
@@ -279,8 +281,9 @@ def _fit(
 def _follow(events: "Iterable[FitEvent]", page: "LivePage | None" = None) -> "Finished":
     """Shows a fit's events as progress bars and lines, and its object on a page, until it is finished."""
     from .fit.events import Finished, Note, Preview, StageStarted, Step
+    from .jit import when_compiling
 
-    with _bars() as progress:
+    with _bars() as progress, when_compiling(lambda: progress.console.print(_COMPILING)):
         task = None
         for event in events:
             match event:

@@ -10,6 +10,7 @@ from typing import Any
 import joblib
 import numpy as np
 from numba import get_num_threads, njit, set_num_threads
+from numba.core import event
 
 # All freedom but the one to assume that there is no NaN or infinity: the guards against those must stay.
 _FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
@@ -55,6 +56,28 @@ def lanes() -> Iterator[int]:
             yield count
         finally:
             set_num_threads(before)
+
+
+class _FirstStart(event.Listener):
+    """Calls a function once, at the first event's start."""
+
+    def __init__(self, say: Callable[[], object]):
+        self.say: Callable[[], object] | None = say
+
+    def on_start(self, event: event.Event) -> None:  # noqa: ARG002
+        say, self.say = self.say, None
+        if say is not None:
+            say()
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+@contextmanager
+def when_compiling(say: Callable[[], object]) -> Iterator[None]:
+    """Within, `say` is called once if a kernel is not in the cache and has to be compiled."""
+    with event.install_listener("numba:compile", _FirstStart(say)):
+        yield
 
 
 @kernel()
