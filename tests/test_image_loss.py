@@ -111,3 +111,15 @@ def test_the_same_bytes_for_any_number_of_threads(monkeypatch, lanes):
         assert run(1) == run(lanes)
     finally:
         numba.set_num_threads(before)
+
+
+def test_a_second_backward_pass_adds_the_same_gradient_again():
+    rgb, alpha, target, target_alpha = make_images(20, 30)
+    leaves = [value.requires_grad_() for value in (rgb, alpha)]
+    loss = image_loss(*leaves, target, target_alpha)
+    (3 * loss).backward(retain_graph=True)
+    once = [leaf.grad.clone() for leaf in leaves]
+    (6 * loss).backward(retain_graph=True)
+    (0 * loss).backward()
+    for leaf, first in zip(leaves, once, strict=True):
+        torch.testing.assert_close(leaf.grad, 3 * first)

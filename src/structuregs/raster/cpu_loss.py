@@ -23,12 +23,17 @@ class ImageLoss(torch.autograd.Function):
         parts = np.empty((-(-height // lk.ROWS) * -(-width // lk.COLUMNS), 3))
         with lanes() as threads:
             lk.loss_and_gradient(image, target, *arrays[2:], weights.astype(np.float32), threads, g_image, g_alpha, parts)
-        ctx.save_for_backward(torch.from_numpy(g_image).view(height, width, 3), torch.from_numpy(g_alpha))
+        ctx.gradients, ctx.scale = (torch.from_numpy(g_image).view(height, width, 3), torch.from_numpy(g_alpha)), 1.0
         return torch.tensor(float(parts.sum(0) @ weights), dtype=rgb.dtype)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *gradients):
-        """The gradients of rgb and alpha."""
-        g_image, g_alpha = ctx.saved_tensors
-        return g_image * gradients[0], g_alpha * gradients[0], None, None, None, None
+        """The gradients of rgb and alpha, scaled where they lie: new memory for them would cost as much as the loss."""
+        scale = float(gradients[0])
+        if scale == 0:
+            return *(torch.zeros_like(g) for g in ctx.gradients), None, None, None, None
+        for gradient in ctx.gradients:
+            gradient.mul_(scale / ctx.scale)
+        ctx.scale = scale
+        return *ctx.gradients, None, None, None, None
