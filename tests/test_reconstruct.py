@@ -237,7 +237,10 @@ class TestGoingOn:
 
 
 def test_two_pieces_of_one_part_become_one_and_the_run_ends(slider: Path, begun: Path, tmp_path: Path):
-    """Joining parts replaces the state of the fit under way; checkpoints and the result must be of the new one."""
+    """Joining parts replaces the state of the fit under way; checkpoints and the result must be of the new one.
+
+    The photos show neither piece, so what the two become need not move, and is the base's next.
+    """
     run = tmp_path / "run"
     shutil.copytree(begun, run)
     turn = SE3.exp(torch.tensor([0.1, 0.2, 0, 0, 0, 0.5], dtype=torch.float64))
@@ -248,7 +251,8 @@ def test_two_pieces_of_one_part_become_one_and_the_run_ends(slider: Path, begun:
     (run / "config.json").write_text(json.dumps(record | {"fit": asdict(still)}))
     events = list(fit_run(load_capture(slider), run, still, device="cpu", seed=3))
     assert Note("two parts that move alike are one from step 3 on; 1 left") in events
-    assert finished(events).parts.counts == (120, 240)
+    assert Note("a part that need not move is the base's from step 3 on; 0 left") in events
+    assert finished(events).parts.counts == (360,)
     assert FitState.load(run / "checkpoints" / "last.pt").step == 30
 
 
