@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from ..geometry import SE3, Box, Camera
 from ..jit import lanes
+from .structure_kernels import GRADIENTS, occupancy_losses
 
 
 def structure_images(
@@ -144,8 +145,6 @@ class _Occupancy(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, rotations, centres, half_extents, origin, rays, mask, weights, softness) -> Tensor:
-        from .structure_kernels import GRADIENTS, occupancy_losses
-
         arrays = [t.detach().float().contiguous().numpy() for t in (rotations, centres, half_extents)]
         view = [t.detach().float().contiguous().numpy() for t in (origin, rays, mask)]
         hardness = np.minimum(0.5 * arrays[2].min(-1), np.float32(softness))

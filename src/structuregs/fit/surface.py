@@ -10,6 +10,7 @@ from ..geometry import Camera
 from ..jit import lanes
 from ..model import Splats
 from ..raster import render_planes
+from .surface_kernels import slopes_and_gradient
 
 _STEPS = (1, 3, 9, 27)  # pixels between two that are held against each other: near ones see noise, far ones see bulges
 _EDGE = 20.0  # how fast two pixels cease to be on one face with what colour (in [0, 1]) changes on the way between them
@@ -79,8 +80,6 @@ class _Slopes(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, planes, camera, solid, changes) -> Tensor:
-        from .surface_kernels import slopes_and_gradient
-
         arrays = [t.detach().float().contiguous().numpy() for t in (planes, solid, changes)]
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
         gradient, parts = np.empty_like(arrays[0]), np.empty(len(arrays[0]))

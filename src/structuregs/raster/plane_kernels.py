@@ -85,8 +85,6 @@ def planes_backward(means, quats, log_scales, W, t, steepest, least, g_planes, d
         d_means[i, 0], d_means[i, 1], d_means[i, 2] = world_column(W, c[0], c[1], c[2])
         a = world_column(W, sign * n[0] + turn * sight[0], sign * n[1] + turn * sight[1], sign * n[2] + turn * sight[2])
         j, none = _shortest(log_scales, i), (_ZERO, _ZERO, _ZERO)
-        w, x, y, z, size = unit_quat(quats, i)
-        q = quat_gradient(w, x, y, z, a if j == 0 else none, a if j == 1 else none, a if j == 2 else none)
-        along = q[0] * w + q[1] * x + q[2] * y + q[3] * z
-        d_quats[i, 0], d_quats[i, 1] = (q[0] - along * w) * size, (q[1] - along * x) * size
-        d_quats[i, 2], d_quats[i, 3] = (q[2] - along * y) * size, (q[3] - along * z) * size
+        d_quats[i, 0], d_quats[i, 1], d_quats[i, 2], d_quats[i, 3] = quat_gradient(
+            unit_quat(quats, i), a if j == 0 else none, a if j == 1 else none, a if j == 2 else none
+        )

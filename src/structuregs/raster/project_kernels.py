@@ -137,13 +137,21 @@ def project_forward(means, quats, log_scales, logits, W, t, lens, size, xy, coni
 
 
 @kernel()
-def quat_gradient(w, x, y, z, c0, c1, c2):
-    """Gradient of a unit quaternion from that of its rotation matrix, given by columns."""
-    return (
+def quat_gradient(unit, c0, c1, c2):
+    """Gradient of a quaternion from that of its rotation matrix, given by columns; unit: as of `unit_quat`."""
+    w, x, y, z, inverse = unit
+    g = (
         _TWO * (x * (c1[2] - c2[1]) + y * (c2[0] - c0[2]) + z * (c0[1] - c1[0])),
         _TWO * (y * (c1[0] + c0[1]) + z * (c2[0] + c0[2]) + w * (c1[2] - c2[1]) - _TWO * x * (c1[1] + c2[2])),
         _TWO * (x * (c1[0] + c0[1]) + z * (c2[1] + c1[2]) + w * (c2[0] - c0[2]) - _TWO * y * (c0[0] + c2[2])),
         _TWO * (x * (c2[0] + c0[2]) + y * (c2[1] + c1[2]) + w * (c0[1] - c1[0]) - _TWO * z * (c0[0] + c1[1])),
+    )
+    along = g[0] * w + g[1] * x + g[2] * y + g[3] * z
+    return (
+        (g[0] - along * w) * inverse,
+        (g[1] - along * x) * inverse,
+        (g[2] - along * y) * inverse,
+        (g[3] - along * z) * inverse,
     )
 
 
@@ -220,8 +228,8 @@ def project_backward(
             d_means[i, :], d_quats[i, :], d_log_scales[i, :] = np.float32(0), np.float32(0), np.float32(0)
             continue
         p = camera_point(W, t, means, i)
-        qw, qx, qy, qz, inverse = unit_quat(quats, i)
-        R, s = rotation(qw, qx, qy, qz), _scales(log_scales, i)
+        unit = unit_quat(quats, i)
+        R, s = rotation(unit[0], unit[1], unit[2], unit[3]), _scales(log_scales, i)
         a_x, a_y, a_z = _axes(W, R, s)
         u, v = min(max(p[0] / p[2], lens[4]), lens[5]), min(max(p[1] / p[2], lens[6]), lens[7])
         f_x, f_y = lens[0] / p[2], lens[1] / p[2]
@@ -238,7 +246,4 @@ def project_backward(
         d_log_scales[i, 1] = c1[0] * R[0][1] + c1[1] * R[1][1] + c1[2] * R[2][1]
         d_log_scales[i, 2] = c2[0] * R[0][2] + c2[1] * R[1][2] + c2[2] * R[2][2]
 
-        g = quat_gradient(qw, qx, qy, qz, c0, c1, c2)
-        along = g[0] * qw + g[1] * qx + g[2] * qy + g[3] * qz
-        d_quats[i, 0], d_quats[i, 1] = (g[0] - along * qw) * inverse, (g[1] - along * qx) * inverse
-        d_quats[i, 2], d_quats[i, 3] = (g[2] - along * qy) * inverse, (g[3] - along * qz) * inverse
+        d_quats[i, 0], d_quats[i, 1], d_quats[i, 2], d_quats[i, 3] = quat_gradient(unit, c0, c1, c2)
