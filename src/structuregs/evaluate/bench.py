@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..export.assets import replace_file
+
 _COMMAND = (sys.executable, "-c", "from structuregs.cli import main; main()")
 
 
@@ -92,14 +94,14 @@ def _row(plan: Bench, name: str, capture: Path, views: int | None, seed: int) ->
         options += [] if views is None else ["--views", str(views)]
         try:
             peak = _call(plan, run, "fit", str(capture), "-o", str(run), *options)
-            staged = file.with_suffix(".part")
+            staged = file.with_name(f"{run.name}.eval.json")
             _call(plan, run, "eval", str(run), "--protocol", plan.protocol, "--json", str(staged))
         except RuntimeError as error:
             return BenchRow(capture, views, seed, None, str(error))
         # On a run that was taken up again the memory is that of its last sitting.
         record = json.loads(staged.read_text()) | {"peak_gb": peak}
-        staged.write_text(json.dumps(record, indent=1) + "\n")
-        staged.replace(file)
+        replace_file(file, json.dumps(record, indent=1) + "\n")
+        staged.unlink()
     return BenchRow(capture, views, seed, json.loads(file.read_text()))
 
 

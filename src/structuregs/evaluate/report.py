@@ -9,6 +9,7 @@ from typing import Any
 import trimesh
 
 from ..capture import Capture, Truth, find_truth, load_capture, load_truth
+from ..export.assets import replace_file
 from ..export.mesh import part_meshes
 from ..model import ArticulatedObject, load_object
 from .images import psnr_on_views
@@ -145,10 +146,7 @@ def evaluate_object(
 
 def write_report(report: Report, file: Path) -> None:
     """Writes a report as JSON, aside and then into place."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    staged = file.with_name(file.name + ".part")
-    staged.write_text(json.dumps(report.as_json(), indent=1) + "\n")
-    staged.replace(file)
+    replace_file(file, json.dumps(report.as_json(), indent=1) + "\n")
 
 
 def capture_of_run(run: Path) -> Path:

@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from ..export.assets import replace_file
 from .bench import Bench, BenchRow
 
 METRICS = ("Ang Err", "Pos Err", "Geo Dist", "CD-s", "CD-m", "CD-w")
@@ -178,8 +179,4 @@ def write_tables(plan: Bench, rows: Sequence[BenchRow]) -> list[Path]:
         for row in rows
     ]
     contents = {"table.md": "\n".join(text), "table.csv": out.getvalue(), "table.json": json.dumps(records, indent=1) + "\n"}
-    for name, content in contents.items():
-        staged = plan.folder / f"{name}.part"
-        staged.write_text(content)
-        staged.replace(plan.folder / name)
-    return [plan.folder / name for name in contents]
+    return [replace_file(plan.folder / name, content) for name, content in contents.items()]
