@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..geometry import SE3, Box, Screw, screw_at
@@ -50,15 +51,16 @@ class Hypothesis:
 
 
 def hinge_screws(box: Box) -> list[Screw]:
-    """Turns about lines along the box's axes: its edges, the mid-lines of its faces and of itself, and lines a little beyond.
+    """Turns about lines along the box's axes: its edges, the mid-lines of its faces and of itself, and lines beyond.
 
-    Near its hinge a part hardly moves, so that what is seen to move, and its box, end before the hinge.
+    Near its hinge a part hardly moves, and what lies before something else does not show in the masks, so that what is seen
+    to move, and its box, end before the hinge, in few views by more than half of the part.
     """
     screws = []
     R, centre, h = box.T_world_box.rotation, box.T_world_box.xyz, box.half_extents
     for axis in range(3):
         b, c = (axis + 1) % 3, (axis + 2) % 3
-        for i, j in itertools.product((-1.6, -1.3, -1, 0, 1, 1.3, 1.6), repeat=2):
+        for i, j in itertools.product((-3, -2.2, -1.6, -1.3, -1, 0, 1, 1.3, 1.6, 2.2, 3), repeat=2):
             if abs(i) > 1 and abs(j) > 1:
                 continue
             screws.append(Screw("revolute", R[:, axis], centre + R[:, b] * h[b] * i + R[:, c] * h[c] * j))
@@ -131,15 +133,18 @@ def hull_scores(
     return outside, 1 - box.contains(back, margin=2 * other.voxel).double().mean(1).numpy()
 
 
-def oddity(motion: SE3, box: Box) -> float:
-    """How unlike a joint's a motion is: 0 for a short slide, or a turn about an axis at the box, and without a slide along it.
+def oddity(motion: SE3, box: Box, still: KDTree) -> float:
+    """How unlike a joint's a motion is: 0 for a short slide, or a turn about a line where the part meets what stands still.
 
-    The sum of three lengths over the box's half diagonal: the gap between the axis and the box and the slide along the
-    axis, each counted up to 1 and only for turns, and the travel of the corners: of two that look alike, the shorter way.
+    The sum of lengths over the box's half diagonal: the travel of the corners (of two that look alike, the shorter way) and,
+    for turns, the slide along the axis and fourfold the distance from the axis, beside the box, to what stands still; these
+    two count up to 1.  A panel looks much the same however it is laid upon its place, and in another light the wrong way
+    may look better; but only the true way turns about a hinge.
 
     Args:
         motion: of the box, in the world, float64.
         box: where the part is before the motion.
+        still: points of what stands still, in the world.
     """
     size = float(box.half_extents.norm())
     centre = box.T_world_box.xyz
@@ -147,12 +152,19 @@ def oddity(motion: SE3, box: Box) -> float:
     total = travel / size
     if float(motion.angle) > np.deg2rad(5):
         screw, _ = screw_at(motion, "revolute", centre)
-        line = torch.linspace(-2, 2, 41, dtype=torch.float64)[:, None] * size * screw.axis + screw.origin
-        local = box.T_world_box.inverse().apply(line).abs() - box.half_extents
-        gap = float(local.clamp(min=0).norm(dim=-1).amin())
         slide = abs(float(screw.axis @ (motion.apply(centre) - centre)))
-        total += min(gap / size, 1.0) + min(slide / size, 1.0)
+        along = (box.corners - screw.origin) @ screw.axis
+        beside = torch.from_numpy(np.linspace(float(along.min()), float(along.max()), 15))[:, None] * screw.axis + screw.origin
+        standoff = float(np.median(still.query(beside.numpy())[0]))
+        total += min(slide / size, 1.0) + 4 * min(standoff / size, 1.0)
     return total
+
+
+def flips(motion: SE3, box: Box) -> list[SE3]:
+    """The motion followed by half a turn about each of the moved box's axes: it comes to lie in the same place."""
+    moved = box.moved(motion)
+    axes = moved.T_world_box.rotation.T
+    return [Screw("revolute", axis, moved.T_world_box.xyz).motion(np.pi) @ motion for axis in axes]
 
 
 def displacements(motions: SE3, one: SE3, box: Box) -> Float64[np.ndarray, " M"]:

@@ -6,11 +6,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from scipy.optimize import minimize_scalar
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..geometry import SE3, Box, screw_at
 from ..joints import kind_of
-from ..model import Splats
+from ..model import SH_C0, Splats
 from ..raster import image_loss, render
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
@@ -26,11 +27,13 @@ class Scene:
         look: the photos' state.
         rest: splats of all the rest, in the world.
         views: which photos judge; every fourth does for a quick look.
+        still: points of what stands still, in the world.
     """
 
     look: StateLook
     rest: Splats
     views: Int64[np.ndarray, " L"]
+    still: KDTree
 
     def loss(self, part: Splats, v: int) -> Float[Tensor, ""]:
         """Error of one photo with the part where it is."""
@@ -50,9 +53,25 @@ class Scene:
         """Mean error of the judging photos without the part."""
         return float(np.mean([float(self.loss(part[:0], int(v))) for v in self.views]))
 
+    @torch.no_grad()
+    def footprint(self, part: Splats) -> float:
+        """Mean share of the judging photos that shows the part where it is."""
+        both = Splats.concatenate([self.rest, part])
+        white = torch.arange(len(both)) >= len(self.rest)
+        sh = torch.zeros(len(both), 1, 3)
+        sh[:, 0] = torch.where(white, 0.5, -0.5)[:, None] / SH_C0
+        marked, black = replace(both, sh=sh), torch.zeros(3)
+        return float(
+            np.mean([float(render(marked, self.look.stack.cameras[v], background=black).rgb.mean()) for v in self.views])
+        )
+
     def judge(self, hypothesis: Hypothesis, part: Splats, quick: bool = False) -> Hypothesis:
         """The hypothesis with its image error."""
         return replace(hypothesis, image_error=self.error(part, hypothesis.motion, quick))
+
+    def moved(self, hypothesis: Hypothesis, motion: SE3, box: Box) -> Hypothesis:
+        """The hypothesis with another motion of its box; what masks and photos say is still that of the old one."""
+        return replace(hypothesis, motion=motion, oddity=oddity(motion, box, self.still))
 
 
 def refine(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, steps: int, rate: float) -> Hypothesis:
@@ -82,7 +101,7 @@ def refine(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, steps: 
         loss.backward()
         optimiser.step()
     motion = (turn_about(centre, (tangent * unit).detach()) @ start).to(dtype=torch.float64)
-    moved = replace(hypothesis, motion=motion, oddity=oddity(motion, box))
+    moved = scene.moved(hypothesis, motion, box)
     return min(scene.judge(hypothesis, part), scene.judge(moved, part), key=lambda h: h.image_error)
 
 
@@ -114,7 +133,7 @@ def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, base:
     enough = hypothesis.image_error + 0.05 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent
     for screw, q in candidates:
         simple = screw.motion(q)
-        judged = scene.judge(replace(hypothesis, motion=simple, oddity=oddity(simple, box)), part)
+        judged = scene.judge(scene.moved(hypothesis, simple, box), part)
         if judged.image_error < enough:
             return judged
     return hypothesis

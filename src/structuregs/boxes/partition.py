@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from ..geometry import SE3, Box
 from ..model import Splats
 from .cue import CueConfig, StateLook, box_around, clusters
-from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, hull_scores, oddity, stack_motions
+from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, flips, hull_scores, oddity, stack_motions
 from .judge import NOISE, Scene, measured, refine, simplest
 
 
@@ -23,9 +23,12 @@ class SearchConfig:
     cue: CueConfig = field(default_factory=CueConfig)
     """The motion cue."""
     most: int = 12
-    """Clusters that are looked at, the largest first."""
+    """Clusters that are looked at, the largest first, of twice as many."""
     together: int = 3
     """A part may show as several clusters of a state: the boxes of so many with any one are laid upon the other state's."""
+    there: float = 0.12
+    """A cluster whose absence costs the photos of its own state less than this, in mean error of the pixels that show it, is
+    no surface, but splats in the air before one that few views see; surfaces come out at .15 to 1, these below .1."""
     clear: float = 3.0
     """Splats this near to a cluster's box, in voxels, belong to it."""
     shortlist: int = 110
@@ -54,7 +57,7 @@ class MovingPart:
 
     Attributes:
         state: the state whose cluster it was found by.
-        points: of its surface, in that state, in the world.
+        pieces: points of its surface, in that state, in the world: those of each cluster that it was found as.
         hypothesis: its motion from `state` to the other state.
         gain: fraction that it takes off the error of the other state's photos.
         weight: what the photos of its own state would lose without it, in mean error.
@@ -62,11 +65,16 @@ class MovingPart:
     """
 
     state: int
-    points: Float64[np.ndarray, "P 3"]
+    pieces: tuple[Float64[np.ndarray, "_ 3"], ...]
     hypothesis: Hypothesis
     gain: float
     weight: float
     rivals: tuple[Hypothesis, ...] = ()
+
+    @property
+    def points(self) -> Float64[np.ndarray, "P 3"]:
+        """All of its points, in its own state."""
+        return np.concatenate(self.pieces)
 
     @property
     def motion(self) -> SE3:
@@ -87,9 +95,14 @@ class PartSearch:
         self.config = config
         self.generator = np.random.default_rng(seed)
         self.voxel = looks[0].hull.voxel
-        self.clusters = clusters(looks, config.cue)[: config.most]
+        self.clusters = clusters(looks, config.cue)
         self.boxes = [self._box(cluster.points) for cluster in self.clusters]
-        self.base_box = self._box(self._still_points())
+        still = self._still_points()
+        self.base_box, self.still = self._box(still), KDTree(still)
+        seen = [(index, *self._seen(index)) for index in range(len(self.clusters[: 2 * config.most]))]
+        there = [(index, weight) for index, weight, footprint in seen if weight > config.there * footprint][: config.most]
+        self.clusters, self.boxes = [self.clusters[i] for i, _ in there], [self.boxes[i] for i, _ in there]
+        self.weights = [weight for _, weight in there]
         self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
 
     def _box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
@@ -106,15 +119,22 @@ class PartSearch:
             rows.append(look.points[still])
         return max(rows, key=len)
 
+    def _splats_of(self, part: MovingPart) -> Splats:
+        """A part's splats in its own state: in its pieces' boxes, as one around all may hold some of the base."""
+        splats = self.looks[part.state].splats
+        return splats[self._inside(splats, [self._box(points) for points in part.pieces])]
+
     def _inside(self, splats: Splats, boxes: list[Box]) -> torch.Tensor:
         inside = torch.zeros(len(splats), dtype=torch.bool)
         for box in boxes:
             inside |= box.contains(splats.means.double(), margin=self.config.clear * self.voxel)
         return inside
 
-    def _judges(self, state: int) -> np.ndarray:
+    def _scene(self, state: int, rest: Splats) -> Scene:
+        """A state's photos, evenly spread, as judges of a part among all the rest."""
         count = len(self.looks[state].stack)
-        return np.unique(np.linspace(0, count - 1, min(self.config.looks, count)).round().astype(int))
+        views = np.unique(np.linspace(0, count - 1, min(self.config.looks, count)).round().astype(int))
+        return Scene(self.looks[state], rest, views, self.still)
 
     def search(self, count: int | None) -> list[MovingPart]:
         """The moving parts with the motions that the photos prefer: all that explain something, or the `count` best."""
@@ -144,8 +164,7 @@ class PartSearch:
             parts.append(part)
             explained |= members | self._explained_by(part)
         self.left_over = [what for index, what in refused.items() if index not in explained]
-        if len(parts) > 1:
-            parts = self._settled(self._without_pieces(self._reconsider(parts)))
+        parts = self._settled(self._without_pieces(self._reconsider(parts)))
         return sorted(parts, key=lambda part: -part.weight)
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
@@ -158,7 +177,7 @@ class PartSearch:
             box, piece, scene, absent = self._again(part, others)
             shared = [p.motion if state == 0 else p.motion.inverse() for p in others]
             own = part.hypothesis
-            guests = [replace(own, motion=T, oddity=oddity(T, box)) for T in shared]
+            guests = [scene.moved(own, T, box) for T in shared]
             starts = [own, *part.rivals[:2], *guests]
             again = [self._pulled(h, scene, piece, box, absent, part.weight, self.config.steps) for h in starts]
             by_cost = sorted(again, key=lambda h: h.cost(part.weight))
@@ -203,17 +222,17 @@ class PartSearch:
         """A part's box and splats, the photos of the other state with all other parts in place, and their error without it."""
         box = self._box(part.points)
         other = 1 - part.state
-        scene = Scene(self.looks[other], self._rest(others, part.state), self._judges(other))
-        splats = self.looks[part.state].splats
-        piece = splats[self._inside(splats, [box])]
+        scene = self._scene(other, self._rest(others, part.state))
+        piece = self._splats_of(part)
         return box, piece, scene, scene.absent(piece)
 
     def _settled(self, parts: list[MovingPart]) -> list[MovingPart]:
-        """The parts after one longer refinement of each, with the motions of the others as they now are."""
+        """The parts after a longer look at each and the ways it can lie, with the motions of the others as they now are."""
         parts = list(parts)
         for index, part in enumerate(parts):
             box, piece, scene, absent = self._again(part, parts[:index] + parts[index + 1 :])
-            starts = [part.hypothesis, *part.rivals[:1]]
+            own = part.hypothesis
+            starts = [own, *part.rivals[:1], *(scene.moved(own, T, box) for T in flips(own.motion, box))]
             again = [self._pulled(h, scene, piece, box, absent, part.weight, 2 * self.config.steps) for h in starts]
             best = min(again, key=lambda h: h.cost(part.weight))
             parts[index] = replace(part, hypothesis=measured(best, scene, piece, box))
@@ -229,12 +248,13 @@ class PartSearch:
 
     def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
         """The parts with two of them made one, which moves as the leader does."""
+        to_leader = leader.hypothesis.motion.inverse()
         there = (
-            follower.points
+            follower.pieces
             if follower.state == leader.state
-            else leader.hypothesis.motion.inverse().apply(torch.from_numpy(follower.points)).numpy()
+            else tuple(to_leader.apply(torch.from_numpy(points)).numpy() for points in follower.pieces)
         )
-        return [replace(leader, points=np.concatenate([leader.points, there])), *rest]
+        return [replace(leader, pieces=leader.pieces + there), *rest]
 
     def _explained_by(self, part: MovingPart) -> set[int]:
         """Clusters of either state that lie where the part is in that state."""
@@ -272,16 +292,16 @@ class PartSearch:
             sample = self._sample(self.clusters[i].points, 100)
             fits[i] = hull_scores(motions, sample, target.hull, np.zeros((0, 3)), self.boxes[i])[0] < 0.8
 
-        scene = Scene(target, self._rest(parts, state), self._judges(other))
+        scene = self._scene(other, self._rest(parts, state))
         absent = scene.absent(target.splats)
         judged: list[tuple[Hypothesis, frozenset[int]]] = []
         for m in ranked:
             together = frozenset(i for i in siblings if fits[i, m])
             for group in {frozenset(), together}:
                 motion = motions[int(m)]
-                start = Hypothesis(motion, float(outside[m]), float(unexplained[m]), oddity(motion, box))
+                start = Hypothesis(motion, float(outside[m]), float(unexplained[m]), oddity(motion, box, self.still))
                 judged.append((scene.judge(start, self._piece({index, *group}), quick=True), group))
-        weight = self._weight(index)
+        weight = self.weights[index]
         refined = []
         for start, group in self._finalists(judged, box, weight):
             piece = self._piece({index, *group})
@@ -292,9 +312,9 @@ class PartSearch:
         best, group = refined[0]
         members = {index, *group}
         best = measured(best, scene, self._piece(members), box)
-        points = np.concatenate([self.clusters[i].points for i in sorted(members)])
+        pieces = tuple(self.clusters[i].points for i in sorted(members))
         gain = (absent - best.image_error) / absent
-        return MovingPart(state, points, best, gain, weight, tuple(rival for rival, _ in refined[1:])), members
+        return MovingPart(state, pieces, best, gain, weight, tuple(rival for rival, _ in refined[1:])), members
 
     def _unions(self, indices: list[int], always: set[int]) -> list[Box]:
         """Boxes of what may be one part: the clusters in `always` with none, one, two or all of the largest others."""
@@ -325,13 +345,14 @@ class PartSearch:
         splats = self.looks[self.clusters[min(members)].state].splats
         return splats[self._inside(splats, [self.boxes[i] for i in sorted(members)])]
 
-    def _weight(self, index: int) -> float:
-        """What the photos of its own state lose without a cluster."""
+    def _seen(self, index: int) -> tuple[float, float]:
+        """What the photos of its own state lose without a cluster, in mean error, and the share of them that shows it."""
         state = self.clusters[index].state
         splats = self.looks[state].splats
         inside = self._inside(splats, [self.boxes[index]])
-        scene, piece = Scene(self.looks[state], splats[~inside], self._judges(state)), splats[inside]
-        return max(scene.absent(piece) - scene.error(piece, SE3.identity(dtype=torch.float64)), 0.0)
+        scene, piece = self._scene(state, splats[~inside]), splats[inside]
+        lost = scene.absent(piece) - scene.error(piece, SE3.identity(dtype=torch.float64))
+        return max(lost, 0.0), scene.footprint(piece)
 
     def _rest(self, parts: list[MovingPart], state: int) -> Splats:
         """All that stands still in `state`, with the parts found so far as they stand in the other state."""
@@ -343,8 +364,7 @@ class PartSearch:
         """Splats of the parts found so far as they stand in the state other than `state`, each from the one that shows it."""
         rows = []
         for part in parts:
-            source = self.looks[part.state].splats
-            piece = source[self._inside(source, [self._box(part.points)])]
+            piece = self._splats_of(part)
             rows.append(piece.moved(part.hypothesis.motion) if part.state == state else piece)
         return rows
 
