@@ -90,25 +90,29 @@ def registrations(box: Box, target: Box) -> list[SE3]:
     return motions
 
 
-def candidate_motions(box: Box, base: Box, pairs: list[tuple[Box, Box]]) -> SE3:
+def candidate_motions(wholes: list[Box], base: Box, pairs: list[tuple[Box, Box]]) -> SE3:
     """All motions worth a look for a cluster: M rigid motions of the world, float64.
 
     Args:
-        box: of the cluster; its hinges and slides are tried.
+        wholes: boxes of the cluster and of what it may be a piece of; their hinges and slides are tried.
         base: the base's box, for more slides.
         pairs: boxes of what may be one part in the cluster's state and in the other; the one is laid upon the other.
     """
-    rows = [SE3.identity(dtype=torch.float64).wxyz_xyz]
-    for screw in hinge_screws(box):
-        rows += [screw.motion(sign * angle).wxyz_xyz for angle in _ANGLES for sign in (1, -1)]
-    reach = float(box.half_extents.max())
-    for screw in slide_screws(box, base):
-        along = box.T_world_box.rotation.T @ screw.axis
-        size = max(float((along.abs() * 2 * box.half_extents).sum()), 0.2 * reach)
-        rows += [screw.motion(sign * length * size).wxyz_xyz for length in _LENGTHS for sign in (1, -1)]
+    rows = [SE3.identity(1, dtype=torch.float64).wxyz_xyz]
+    for box in wholes:
+        rows += [screw.motion(_both_ways(_ANGLES)).wxyz_xyz for screw in hinge_screws(box)]
+        reach = float(box.half_extents.max())
+        for screw in slide_screws(box, base):
+            along = box.T_world_box.rotation.T @ screw.axis
+            size = max(float((along.abs() * 2 * box.half_extents).sum()), 0.2 * reach)
+            rows.append(screw.motion(_both_ways(_LENGTHS * size)).wxyz_xyz)
     for source, target in pairs:
-        rows += [motion.wxyz_xyz for motion in registrations(source, target)]
-    return SE3(torch.stack(rows))
+        rows.append(stack_motions(registrations(source, target)).wxyz_xyz)
+    return SE3(torch.cat(rows))
+
+
+def _both_ways(amounts: Float64[Tensor, " A"]) -> Float64[Tensor, " 2*A"]:
+    return torch.stack([amounts, -amounts], 1).flatten()
 
 
 def hull_scores(
@@ -184,9 +188,9 @@ def distinct(motions: SE3, box: Box, gap: float, most: int) -> list[int]:
     return kept
 
 
-def stack_motions(hypotheses: list[Hypothesis]) -> SE3:
-    """Their motions as one batch."""
-    return SE3(torch.stack([hypothesis.motion.wxyz_xyz for hypothesis in hypotheses]))
+def stack_motions(motions: list[SE3]) -> SE3:
+    """Single motions as one batch."""
+    return SE3(torch.stack([motion.wxyz_xyz for motion in motions]))
 
 
 def turn_about(centre: Float[Tensor, " 3"], tangent: Float[Tensor, " 6"]) -> SE3:

@@ -16,6 +16,7 @@ from ..raster import image_loss, render
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
+_FEW = 5  # photos that do for a quick look
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
 
@@ -26,7 +27,7 @@ class Scene:
     Attributes:
         look: the photos' state.
         rest: splats of all the rest, in the world.
-        views: which photos judge; every fourth does for a quick look.
+        views: which photos judge; a few of them do for a quick look.
         still: points of what stands still, in the world.
     """
 
@@ -46,7 +47,8 @@ class Scene:
     def error(self, part: Splats, motion: SE3, quick: bool = False) -> float:
         """Mean error of the judging photos with the part moved."""
         moved = part.moved(motion)
-        return float(np.mean([float(self.loss(moved, int(v))) for v in self.views[:: 4 if quick else 1]]))
+        views = self.views[:: max(len(self.views) // _FEW, 1)] if quick else self.views
+        return float(np.mean([float(self.loss(moved, int(v))) for v in views]))
 
     @torch.no_grad()
     def absent(self, part: Splats) -> float:

@@ -45,6 +45,8 @@ class SearchConfig:
     """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
     alike: float = 0.25
     """...and if moving it like the other costs the photos less than this fraction of the part's weight."""
+    shown: float = 0.1
+    """Clusters are moved along with another if the photos of the other state then show this share of their weight."""
     large: float = 0.03
     """A part that holds this fraction of its state's points came from somewhere: it is kept if it does little harm..."""
     harm: float = 0.01
@@ -181,7 +183,7 @@ class PartSearch:
             starts = [own, *part.rivals[:2], *guests]
             again = [self._pulled(h, scene, piece, box, absent, part.weight, self.config.steps) for h in starts]
             by_cost = sorted(again, key=lambda h: h.cost(part.weight))
-            gaps = displacements(SE3(torch.stack([T.wxyz_xyz for T in shared])), by_cost[0].motion, box)
+            gaps = displacements(stack_motions(shared), by_cost[0].motion, box)
             losses = np.array([h.image_error for h in again[-len(shared) :]]) - min(h.image_error for h in again)
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
             # A piece that touches a weightier part, and has no better motion of its own than that part's, belongs to it.
@@ -196,7 +198,7 @@ class PartSearch:
                 index = 0
                 continue
             again = by_cost
-            chosen = distinct(stack_motions(again), box, 0.1, len(again))
+            chosen = distinct(stack_motions([h.motion for h in again]), box, 0.1, len(again))
             parts[index] = replace(part, hypothesis=again[0], rivals=tuple(again[c] for c in chosen[1:]))
             index += 1
         return parts
@@ -278,36 +280,44 @@ class PartSearch:
         open_ = [i for i in range(len(self.clusters)) if i not in done]
         arrivals = [i for i in open_ if self.clusters[i].state == other]
         siblings = [i for i in open_ if self.clusters[i].state == state and i != index]
-        pairs = list(itertools.product(self._unions(siblings, {index}), self._unions(arrivals, set())))
-        motions = candidate_motions(box, self.base_box, pairs)
+        wholes = self._unions(siblings, {index})
+        pairs = list(itertools.product(wholes, self._unions(arrivals, set())))
+        motions = candidate_motions(wholes, self.base_box, pairs)
         landing = np.concatenate([self.clusters[i].points for i in arrivals]) if arrivals else np.zeros((0, 3))
-        landing = self._sample(landing, 300)
-        outside, unexplained = hull_scores(motions, self._sample(cluster.points, 300), target.hull, landing, box)
+        nothing = np.zeros((0, 3))
+        rough = hull_scores(motions, self._sample(cluster.points, 40), target.hull, nothing, box)[0]
+        motions = motions[np.flatnonzero(rough < rough.min() + 1.0)]
+        points, landing = self._sample(cluster.points, 300), self._sample(landing, 300)
+        outside, unexplained = hull_scores(motions, points, target.hull, landing, box)
         travel = displacements(motions, SE3.identity(dtype=torch.float64), box)
         ranked = np.argsort(outside + unexplained + 0.05 * travel, kind="stable")
         ranked = ranked[outside[ranked] < outside.min() + 0.5]
         ranked = ranked[distinct(motions[ranked], box, 0.12, self.config.shortlist)]
-        fits = np.zeros((len(self.clusters), len(outside)), bool)
+        fits = {}
         for i in siblings:
             sample = self._sample(self.clusters[i].points, 100)
-            fits[i] = hull_scores(motions, sample, target.hull, np.zeros((0, 3)), self.boxes[i])[0] < 0.8
+            fits[i] = hull_scores(motions[ranked], sample, target.hull, nothing, self.boxes[i])[0] < 0.8
 
         scene = self._scene(other, self._rest(parts, state))
         absent = scene.absent(target.splats)
         judged: list[tuple[Hypothesis, frozenset[int]]] = []
-        for m in ranked:
-            together = frozenset(i for i in siblings if fits[i, m])
-            for group in {frozenset(), together}:
-                motion = motions[int(m)]
-                start = Hypothesis(motion, float(outside[m]), float(unexplained[m]), oddity(motion, box, self.still))
-                judged.append((scene.judge(start, self._piece({index, *group}), quick=True), group))
+        for row, m in enumerate(ranked):
+            motion = motions[int(m)]
+            start = Hypothesis(motion, float(outside[m]), float(unexplained[m]), oddity(motion, box, self.still))
+            alone = scene.judge(start, self._piece({index}), quick=True)
+            judged.append((alone, frozenset()))
+            if together := frozenset(i for i in siblings if fits[i][row]):
+                joined = scene.judge(start, self._piece({index, *together}), quick=True)
+                share = self.config.shown * sum(self.weights[i] for i in together)
+                if joined.image_error < alone.image_error - share:
+                    judged.append((joined, together))
         weight = self.weights[index]
         refined = []
         for start, group in self._finalists(judged, box, weight):
             piece = self._piece({index, *group})
             refined.append((self._pulled(start, scene, piece, box, absent, weight, self.config.steps), group))
         refined.sort(key=lambda row: row[0].cost(weight))
-        chosen = distinct(stack_motions([h for h, _ in refined]), box, 0.1, len(refined))
+        chosen = distinct(stack_motions([h.motion for h, _ in refined]), box, 0.1, len(refined))
         refined = [refined[c] for c in chosen]
         best, group = refined[0]
         members = {index, *group}
@@ -336,9 +346,9 @@ class PartSearch:
         by_photos = sorted(judged, key=lambda row: row[0].cost(weight))
         rows = []
         for order in (by_photos, judged):
-            chosen = distinct(stack_motions([start for start, _ in order]), box, 0.15, self.config.finalists)
+            chosen = distinct(stack_motions([start.motion for start, _ in order]), box, 0.15, self.config.finalists)
             rows += [order[c] for c in chosen]
-        return [rows[c] for c in distinct(stack_motions([start for start, _ in rows]), box, 0.02, len(rows))]
+        return [rows[c] for c in distinct(stack_motions([start.motion for start, _ in rows]), box, 0.02, len(rows))]
 
     def _piece(self, members: set[int]) -> Splats:
         """The splats of the clusters in `members`, all of one state."""

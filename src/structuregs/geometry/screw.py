@@ -27,12 +27,12 @@ class Screw:
     axis: Float[Tensor, " 3"]
     origin: Float[Tensor, " 3"]
 
-    def motion(self, q: float | Float[Tensor, ""]) -> SE3:
-        """The rigid motion by `q` radians (revolute) or units of length (prismatic)."""
-        q = torch.as_tensor(q, dtype=self.axis.dtype, device=self.axis.device)
+    def motion(self, q: float | Float[Tensor, "*batch"]) -> SE3:
+        """The rigid motions by `q` radians (revolute) or units of length (prismatic)."""
+        along = torch.as_tensor(q, dtype=self.axis.dtype, device=self.axis.device)[..., None] * self.axis
         if self.kind == "prismatic":
-            return SE3.exp(torch.cat([q * self.axis, torch.zeros_like(self.axis)]))
-        turn = SE3.exp(torch.cat([torch.zeros_like(self.axis), q * self.axis]))
+            return SE3.exp(torch.cat([along, torch.zeros_like(along)], -1))
+        turn = SE3.exp(torch.cat([torch.zeros_like(along), along], -1))
         return SE3.from_quat(turn.wxyz, self.origin - turn.apply(self.origin))
 
 
