@@ -6,12 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from ..geometry import SE3, Box
 from ..model import Splats
-from .cue import CueConfig, StateLook, box_around, clusters
+from .cue import Cluster, CueConfig, StateLook, box_around, clusters
 from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, flips, hull_scores, oddity, stack_motions
 from .judge import NOISE, Scene, measured, refine, simplest
 
@@ -97,40 +98,54 @@ class PartSearch:
         self.config = config
         self.generator = np.random.default_rng(seed)
         self.voxel = looks[0].hull.voxel
-        self.clusters = clusters(looks, config.cue)
-        self.boxes = [self._box(cluster.points) for cluster in self.clusters]
-        still = self._still_points()
+        found = clusters(looks, config.cue)
+        still = self._still_points(found)
         self.base_box, self.still = self._box(still), KDTree(still)
-        seen = [(index, *self._seen(index)) for index in range(len(self.clusters[: 2 * config.most]))]
-        there = [(index, weight) for index, weight, footprint in seen if weight > config.there * footprint][: config.most]
-        self.clusters, self.boxes = [self.clusters[i] for i, _ in there], [self.boxes[i] for i, _ in there]
-        self.weights = [weight for _, weight in there]
+        # Of each cluster: its box, its splats among its state's, and what the photos of its state lose without it.
+        self.clusters: list[Cluster] = []
+        self.boxes: list[Box] = []
+        self.held: list[Bool[Tensor, " N"]] = []
+        self.weights: list[float] = []
+        for cluster in found[: 2 * config.most]:
+            if len(self.clusters) < config.most:
+                self._take(cluster)
         self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
 
     def _box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
         return box_around(points, thinnest=0.5 * self.voxel)
 
-    def _still_points(self) -> Float64[np.ndarray, "P 3"]:
-        """Points of either state that no cluster holds."""
+    def _still_points(self, found: list[Cluster]) -> Float64[np.ndarray, "P 3"]:
+        """Points of either state that none of these clusters holds."""
         rows = []
         for state, look in enumerate(self.looks):
             still = np.ones(len(look.points), bool)
-            for cluster, box in zip(self.clusters, self.boxes, strict=True):
+            for cluster in found:
                 if cluster.state == state:
-                    still &= ~box.contains(torch.from_numpy(look.points), margin=self.voxel).numpy()
+                    still &= ~self._box(cluster.points).contains(torch.from_numpy(look.points), margin=self.voxel).numpy()
             rows.append(look.points[still])
         return max(rows, key=len)
 
-    def _splats_of(self, part: MovingPart) -> Splats:
-        """A part's splats in its own state: in its pieces' boxes, as one around all may hold some of the base."""
-        splats = self.looks[part.state].splats
-        return splats[self._inside(splats, [self._box(points) for points in part.pieces])]
+    def _take(self, cluster: Cluster) -> None:
+        """Takes a cluster among those to explain, if the photos of its own state need it where they show it."""
+        splats = self.looks[cluster.state].splats
+        held = self._held(cluster.points, cluster.state)
+        scene, piece = self._scene(cluster.state, splats[~held]), splats[held]
+        weight = scene.absent(piece) - scene.error(piece, SE3.identity(dtype=torch.float64))
+        if weight > self.config.there * scene.footprint(piece):
+            self.clusters.append(cluster)
+            self.boxes.append(self._box(cluster.points))
+            self.held.append(held)
+            self.weights.append(weight)
 
-    def _inside(self, splats: Splats, boxes: list[Box]) -> torch.Tensor:
-        inside = torch.zeros(len(splats), dtype=torch.bool)
-        for box in boxes:
-            inside |= box.contains(splats.means.double(), margin=self.config.clear * self.voxel)
-        return inside
+    def _splats_of(self, part: MovingPart) -> Splats:
+        """A part's splats in its own state: its pieces', as one box around all may hold some of the base."""
+        held = [self._held(points, part.state) for points in part.pieces]
+        return self.looks[part.state].splats[torch.stack(held).any(0)]
+
+    def _held(self, points: Float64[np.ndarray, "P 3"], state: int) -> Bool[Tensor, " N"]:
+        """Which splats of a state lie in the box of points or near it."""
+        means = self.looks[state].splats.means.double()
+        return self._box(points).contains(means, margin=self.config.clear * self.voxel)
 
     def _scene(self, state: int, rest: Splats) -> Scene:
         """A state's photos, evenly spread, as judges of a part among all the rest."""
@@ -353,21 +368,15 @@ class PartSearch:
     def _piece(self, members: set[int]) -> Splats:
         """The splats of the clusters in `members`, all of one state."""
         splats = self.looks[self.clusters[min(members)].state].splats
-        return splats[self._inside(splats, [self.boxes[i] for i in sorted(members)])]
-
-    def _seen(self, index: int) -> tuple[float, float]:
-        """What the photos of its own state lose without a cluster, in mean error, and the share of them that shows it."""
-        state = self.clusters[index].state
-        splats = self.looks[state].splats
-        inside = self._inside(splats, [self.boxes[index]])
-        scene, piece = self._scene(state, splats[~inside]), splats[inside]
-        lost = scene.absent(piece) - scene.error(piece, SE3.identity(dtype=torch.float64))
-        return max(lost, 0.0), scene.footprint(piece)
+        return splats[torch.stack([self.held[i] for i in sorted(members)]).any(0)]
 
     def _rest(self, parts: list[MovingPart], state: int) -> Splats:
         """All that stands still in `state`, with the parts found so far as they stand in the other state."""
         splats = self.looks[state].splats
-        moving = self._inside(splats, [b for c, b in zip(self.clusters, self.boxes, strict=True) if c.state == state])
+        moving = torch.zeros(len(splats), dtype=torch.bool)
+        for cluster, held in zip(self.clusters, self.held, strict=True):
+            if cluster.state == state:
+                moving |= held
         return Splats.concatenate([splats[~moving], *self._placed(parts, state)])
 
     def _placed(self, parts: list[MovingPart], state: int) -> list[Splats]:
