@@ -48,7 +48,7 @@ class SearchConfig:
     """...and if moving it like the other costs the photos less than this fraction of the part's weight."""
     shown: float = 0.1
     """Clusters are moved along with another if the photos of the other state then show this share of their weight."""
-    large: float = 0.03
+    large: float = 0.01
     """A part that holds this fraction of its state's points came from somewhere: it is kept if it does little harm..."""
     harm: float = 0.01
     """...and adds less than this fraction to the photo error; what is shut may show in no photo."""
