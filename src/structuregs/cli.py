@@ -214,6 +214,41 @@ def _number(word: str, option: str) -> int:
     return int(word)
 
 
+def study(
+    kind: Annotated[tyro.conf.Positional[Literal["robustness"]], tyro.conf.arg(metavar="STUDY")],
+    capture: CaptureFolder,
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")],
+    preset: Preset = "default",
+    views: int | None = 10,
+    seed: int = 0,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+) -> None:
+    """Fit a capture under other conditions, and write how the results differ; run it again to go on.
+
+    Args:
+        kind: robustness: from bad starts, as section 2 of the paper's supplement.
+        capture: Folder of the capture.
+        output: Folder of the runs and of robustness.md, robustness.html and error_maps.png.
+        preset: As `fit` takes it.
+        views: Use this many views of each state; None: all.
+        seed: As `fit` takes it.
+        device: Where to compute.
+    """
+    from .capture import find_truth, load_capture, load_truth
+    from .evaluate import RobustnessStudy
+    from .fit.schedule import PRESETS
+
+    photos = load_capture(capture, views=views, seed=seed)
+    truth = find_truth(photos)
+    plan = RobustnessStudy(photos, output, PRESETS[preset], device, seed)
+    settings = plan.settings()
+    for setting in settings:
+        print(f"{kind}: {setting.says}", flush=True)
+        _follow(plan.events(setting))
+    files = plan.write(settings, load_truth(truth) if truth else None)
+    print("wrote " + ", ".join(map(str, files)))
+
+
 def demo(run: NewRun = Path("runs/demo")) -> None:
     """Make a small capture of a known object on the spot, reconstruct it, and print its joints beside the truth.
 
@@ -406,7 +441,16 @@ def main() -> None:
     """Runs the command line; a user's error is one sentence and exit code 2 (`STRUCTUREGS_DEBUG=1` shows the traceback)."""
     try:
         tyro.extras.subcommand_cli_from_dict(
-            {"fit": fit, "eval": evaluate, "render": render, "view": view, "export": export, "bench": bench, "demo": demo},
+            {
+                "fit": fit,
+                "eval": evaluate,
+                "render": render,
+                "view": view,
+                "export": export,
+                "bench": bench,
+                "study": study,
+                "demo": demo,
+            },
             prog="structuregs",
             description="Photos of an articulated object in two states go in; a working digital twin comes out.",
         )

@@ -12,6 +12,7 @@ from .report import (
     training_capture,
     write_report,
 )
+from .robustness import RobustnessStudy, Setting
 from .scores import JointScore, score_joints
 from .surfaces import SURFACE_PROTOCOLS, SurfaceProtocol, SurfaceScore, score_surfaces
 from .tables import write_tables
@@ -24,6 +25,8 @@ __all__ = [
     "JointScore",
     "Protocol",
     "Report",
+    "RobustnessStudy",
+    "Setting",
     "SurfaceProtocol",
     "SurfaceScore",
     "bench",

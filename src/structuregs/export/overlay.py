@@ -10,7 +10,8 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from ..capture import Capture, View, farthest_points
+from ..capture import Capture, View, farthest_points, stack_views
+from ..fit.structure import structure_images, union
 from ..geometry import Box, Camera
 from ..model import ArticulatedObject, Joint
 from .sweep import telling_order
@@ -52,6 +53,46 @@ def write_structure(capture: Capture, obj: ArticulatedObject, file: Path) -> Non
     staged = file.with_name(file.name + ".part")
     draw_structure(capture, obj).save(staged, format="PNG")
     staged.replace(file)
+
+
+def draw_error_maps(capture: Capture, obj: ArticulatedObject, *, size: int = 220) -> Image.Image:
+    """What the losses on boxes see (supplement, figure 1), on the most telling view of each state, a row for each.
+
+    From left to right: the photo, its mask, the structure image of all boxes, what of the mask no box covers (red), and
+    what each moving part's box covers outside the mask, in the part's colour.
+
+    Args:
+        capture: the photos.
+        obj: whose boxes are drawn.
+        size: the side of a square with as many pixels as one picture.
+    """
+    rows = []
+    for state, views in enumerate(capture.train):
+        boxes = obj.boxes_at([joint.q[state] for joint in obj.joints])
+        stack = stack_views(_choose(obj, views, 1), size)
+        origin, directions = stack.cameras[0].rays()
+        rays = torch.nn.functional.normalize(directions.float(), dim=-1)
+        softness = 0.01 * float(boxes.half_extents.norm(dim=-1).max())
+        parts = structure_images(
+            Box(boxes.T_world_box.to(dtype=torch.float32), boxes.half_extents.float()), origin.float(), rays, softness
+        )
+        rgb, mask = stack.target(0)
+        shown = [
+            rgb,
+            _tinted(mask, (0, 0, 0)),
+            _tinted(union(parts), (0, 0, 0)),
+            _tinted((1 - union(parts)) * mask, (220, 30, 30)),
+        ]
+        shown += [_tinted(parts[k] * (1 - mask), colour_of(k)) for k in range(1, len(parts))]
+        rows.append(torch.cat(shown, 1))
+    width = max(row.shape[1] for row in rows)
+    rows = [torch.nn.functional.pad(row, (0, 0, 0, width - row.shape[1]), value=1.0) for row in rows]
+    return Image.fromarray((torch.cat(rows) * 255).round().byte().numpy())
+
+
+def _tinted(amount: Float[Tensor, "H W"], colour: Colour) -> Float[Tensor, "H W 3"]:
+    """White where the amount is 0, and the colour where it is 1."""
+    return 1 - amount[..., None].clamp(0, 1) * (1 - torch.tensor(colour) / 255)
 
 
 def _choose(obj: ArticulatedObject, views: tuple[View, ...], count: int) -> list[View]:

@@ -1,7 +1,5 @@
 """The report of a run: one page with what was found, how well it fits, and how it came about."""
 
-import base64
-import io
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -25,7 +23,7 @@ from .assets import replace_file
 from .chart import Point, line_chart
 from .html import opening_camera
 from .overlay import colour_of, draw_structure
-from .page import filled, page_file
+from .page import filled, image_url, page_file, png_url
 from .sweep import render_sweep, telling_order
 
 _CANDIDATES = 12  # views of each state that the shown ones are chosen from
@@ -147,7 +145,7 @@ def _amount(joint: Joint) -> str:
 def _structure(run: Path, capture: Capture, obj: ArticulatedObject) -> str:
     """Boxes and axes over photos: the run's picture, or one drawn now."""
     file = run / "overview.png"
-    url = _png_url(file.read_bytes()) if file.exists() else _url(draw_structure(capture, obj), "PNG")
+    url = png_url(file.read_bytes()) if file.exists() else image_url(draw_structure(capture, obj), "PNG")
     return (
         "<h3>Boxes and axes over photos of state 0 (above) and state 1 (below)</h3>\n"
         f'<img src="{url}" alt="Boxes and joint axes over photos of both states">'
@@ -188,7 +186,7 @@ def _pairs(views: Sequence[View], splats: Splats, kind: str) -> Iterator[str]:
         target, _ = view.image(view.camera.width, view.camera.height)
         error = psnr(render(splats, view.camera).rgb.clamp(0, 1), torch.from_numpy(target))
         drawn = (render(splats, stack.cameras[v]).rgb.clamp(0, 1) * 255).round().byte().numpy()
-        photo, rendering = (_url(Image.fromarray(rgb), "JPEG") for rgb in (stack.rgb[v], drawn))
+        photo, rendering = (image_url(Image.fromarray(rgb), "JPEG") for rgb in (stack.rgb[v], drawn))
         name = escape(view.name)
         yield (
             f'<figure class="pair"><div><img src="{photo}" alt="Photo {name}">'
@@ -202,7 +200,7 @@ def _sweep(obj: ArticulatedObject, camera: Camera) -> str:
     there = islice(render_sweep(obj, camera, frames=_SWEEP_FRAMES), _SWEEP_FRAMES // 2 + 1)
     first, *others = (Image.fromarray(rgb) for rgb in _cropped(np.stack(list(there))))
     back = others[-2::-1]
-    return _url(first, "WEBP", save_all=True, append_images=others + back, duration=_SWEEP_MS, loop=0, quality=80)
+    return image_url(first, "WEBP", save_all=True, append_images=others + back, duration=_SWEEP_MS, loop=0, quality=80)
 
 
 def _cropped(frames: UInt8[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F h w 3"]:
@@ -251,15 +249,3 @@ def _flat(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]
             yield from _flat(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value)
-
-
-def _url(image: Image.Image, kind: str, **options: Any) -> str:
-    """An image as a data URL."""
-    memory = io.BytesIO()
-    quality = {"quality": 88} if kind == "JPEG" else {}
-    image.save(memory, format=kind, **quality, **options)
-    return f"data:image/{kind.lower()};base64,{base64.b64encode(memory.getvalue()).decode('ascii')}"
-
-
-def _png_url(data: bytes) -> str:
-    return f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"

@@ -1,6 +1,11 @@
 """The pages that are written: templates, styles and scripts, and how they become one file."""
 
+import base64
+import io
 from importlib.resources import files
+from typing import Any
+
+from PIL import Image
 
 
 def page_file(name: str) -> str:
@@ -18,3 +23,28 @@ def filled(template: str, **fields: str) -> str:
     first, *pieces = page_file(template).split("{{")
     texts = (piece.partition("}}") for piece in pieces)
     return first + "".join(fields[name] + rest for name, _, rest in texts)
+
+
+def image_url(image: Image.Image, kind: str, **options: Any) -> str:
+    """An image as a data URL.
+
+    Args:
+        image: what is shown.
+        kind: "JPEG", "PNG" or "WEBP".
+        options: as Pillow's `save` takes them.
+    """
+    data = base64.b64encode(image_bytes(image, kind, **options)).decode("ascii")
+    return f"data:image/{kind.lower()};base64,{data}"
+
+
+def image_bytes(image: Image.Image, kind: str, **options: Any) -> bytes:
+    """An image as a file holds it; arguments as of `image_url`."""
+    memory = io.BytesIO()
+    quality = {"quality": 88} if kind == "JPEG" else {}
+    image.save(memory, format=kind, **quality, **options)
+    return memory.getvalue()
+
+
+def png_url(data: bytes) -> str:
+    """The bytes of a PNG file as a data URL."""
+    return f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"
