@@ -1,5 +1,6 @@
 """The fit's loop: posed parts in, better posed parts out, one view of either state a step."""
 
+import functools
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -169,7 +170,7 @@ class Fitter:
     def _view(self, state: int, count: int) -> int:
         """The view of a state for this step: every view once in each round, in an order of its own."""
         turn, place = divmod(self.state.step, count)
-        return int(np.random.default_rng((self.seed, state, turn)).permutation(count)[place])
+        return int(_order(self.seed, state, turn, count)[place])
 
     def _images(self) -> list[ImageStack]:
         """Both states' images in the size that this step works at."""
@@ -298,6 +299,12 @@ class Fitter:
         if growing and growth.reset and (step + 1) % growth.reset == 0:
             with torch.no_grad():
                 self.state.variables.leaves["logit_opacities"].clamp_(max=float(np.log(0.01 / 0.99)))
+
+
+@functools.lru_cache(maxsize=8)
+def _order(seed: int, state: int, turn: int, count: int) -> np.ndarray:
+    """The order of a state's views in one round."""
+    return np.random.default_rng((seed, state, turn)).permutation(count)
 
 
 def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
