@@ -387,6 +387,13 @@ class TestParts:
         kept = PartSearch((haunted, looks[1]), SMALL.search, seed=0)
         assert [len(c.points) for c in kept.clusters] == [len(c.points) for c in search.clusters]
 
+    def test_where_everything_seems_to_move_it_still_ends(self):
+        looks = looks_of("laptop")[1]
+        everywhere = CueConfig(threshold=-1e3, neighbours=16)  # every point is further from the other state than that
+        search = PartSearch(looks, replace(SMALL.search, cue=everywhere), seed=0)
+        assert len(search.still.data) == len(looks[0].points)
+        assert all(len(part.points) > 0 for part in search.search(None))
+
     @pytest.mark.parametrize("share", [0.0, 1.0])
     def test_a_footprint_is_the_share_of_the_photos_that_a_piece_covers(self, share: float):
         look = looks_of("laptop")[1][0]

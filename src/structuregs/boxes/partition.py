@@ -115,7 +115,7 @@ class PartSearch:
         return box_around(points, thinnest=0.5 * self.voxel)
 
     def _still_points(self, found: list[Cluster]) -> Float64[np.ndarray, "P 3"]:
-        """Points of either state that none of these clusters holds."""
+        """Points of either state that none of these clusters holds; all points of state 0 where they hold everything."""
         rows = []
         for state, look in enumerate(self.looks):
             still = np.ones(len(look.points), bool)
@@ -123,7 +123,7 @@ class PartSearch:
                 if cluster.state == state:
                     still &= ~self._box(cluster.points).contains(torch.from_numpy(look.points), margin=self.voxel).numpy()
             rows.append(look.points[still])
-        return max(rows, key=len)
+        return max(rows, key=len) if any(map(len, rows)) else self.looks[0].points
 
     def _take(self, cluster: Cluster) -> None:
         """Takes a cluster among those to explain, if the photos of its own state need it where they show it."""
