@@ -390,7 +390,7 @@ class TestParts:
     def test_where_everything_seems_to_move_it_still_ends(self):
         looks = looks_of("laptop")[1]
         everywhere = CueConfig(threshold=-1e3, neighbours=16)  # every point is further from the other state than that
-        search = PartSearch(looks, replace(SMALL.search, cue=everywhere), seed=0)
+        search = PartSearch(looks, replace(SMALL.search, cue=everywhere, shortlist=6, finalists=1, steps=5), seed=0)
         assert len(search.still.data) == len(looks[0].points)
         assert all(len(part.points) > 0 for part in search.search(None))
 

@@ -122,7 +122,7 @@ class RobustnessStudy:
         legend = "Photo, mask, structure image of all boxes, what no box covers, and what each box covers outside the mask."
         sections = [
             f"<section><h2>Final errors</h2>{_as_html(table)}</section>",
-            f'<section><h2>Fitting error</h2><div class="curves">{chart}</div></section>',
+            f"<section><h2>Fitting error</h2>{chart}</section>",
             *(self._progress(setting) for setting in settings),
             f'<section><h2>{legend}</h2><img src="{png_url(maps.read_bytes())}" alt="Error maps"></section>',
         ]
