@@ -1,6 +1,6 @@
 """Motion hypotheses: where could a moving cluster be in the other state, and which of these do masks and images allow?
 
-Hinges turn about a box's own edges and slides run along its axes (method.md, points 3 and 4), so that a few hundred rigid
+Hinges turn about a box's own edges and slides run along its axes (method.md, points 3 and 4), so that some thousand rigid
 motions hold one close to the truth.  The other state's hull rules most of them out at once; rendering the rest into the
 other state's photos, and then letting the images pull at the best of them, decides.
 """

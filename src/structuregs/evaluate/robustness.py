@@ -1,6 +1,6 @@
 """How fits fare from bad starts (supplement, section 2, figure 2): other thresholds, noisy, foreign and lopsided points."""
 
-import json
+import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -16,7 +16,8 @@ from ..capture import Capture, Truth
 from ..export.assets import replace_file
 from ..export.chart import curves_chart
 from ..export.overlay import draw_error_maps, draw_structure
-from ..export.page import filled, image_bytes, page_file, png_url
+from ..export.page import image_bytes, plain_page, png_url
+from ..export.report import loss_points
 from ..fit.events import Finished, FitEvent, Preview, Step
 from ..fit.reconstruct import RunFolder, fit_run
 from ..fit.schedule import FitConfig
@@ -75,7 +76,7 @@ class RobustnessStudy:
         if not all(file.exists() for file in files.values()):
             looks = survey(self.capture, "hull", self.config.start, self.seed)
             for name, points in perturbed_points(looks, self.config.start.search.cue, self.seed).items():
-                _write_points(files[name], points)
+                replace_file(files[name], _as_npz(points))
         rows += [Setting(name, says, points=str(files[name].resolve())) for name, says in _SAYS.items()]
         if all(views[0].depth is not None for views in self.capture.train):
             rows.append(Setting("depth", "points from the capture's depth maps", points="depth"))
@@ -91,7 +92,7 @@ class RobustnessStudy:
         cue = self.config.start.search.cue
         search = replace(self.config.start.search, cue=replace(cue, threshold=cue.threshold * setting.threshold))
         config = replace(self.config, start=replace(self.config.start, search=search))
-        moments, step = [round(share * config.steps) for share in _MOMENTS], 0
+        moments, step = self._moments(), 0
         for event in fit_run(self.capture, run, config, device=self.device, points=setting.points, seed=self.seed):
             if isinstance(event, Step) and event.stage == "fit":
                 step = event.step
@@ -102,6 +103,10 @@ class RobustnessStudy:
             if isinstance(event, Finished):
                 self._draw(event.obj, _picture(run, config.steps))
             yield event
+
+    def _moments(self) -> list[int]:
+        """The steps at which the boxes are drawn, but for the last."""
+        return [round(share * self.config.steps) for share in _MOMENTS]
 
     def _draw(self, obj: ArticulatedObject, file: Path) -> None:
         replace_file(file, image_bytes(draw_structure(self.capture, obj, columns=1, size=220), "PNG"))
@@ -115,31 +120,30 @@ class RobustnessStudy:
         """
         objects = {setting: load_object(RunFolder(self.run(setting)).object) for setting in settings}
         table = _table([(setting, _figures(objects[setting], self.capture, truth)) for setting in settings])
-        seen = draw_error_maps(self.capture, objects[settings[0]])
-        maps = replace_file(self.folder / "error_maps.png", image_bytes(seen, "PNG"))
-        curves = {setting.name: _losses(self.run(setting)) for setting in settings}
+        maps = image_bytes(draw_error_maps(self.capture, objects[settings[0]]), "PNG")
+        curves = {setting.name: loss_points(RunFolder(self.run(setting)).records()) for setting in settings}
         chart = curves_chart({name: curve for name, curve in curves.items() if curve}, x_label="step", y_label="Loss", log=True)
         legend = "Photo, mask, structure image of all boxes, what no box covers, and what each box covers outside the mask."
         sections = [
             f"<section><h2>Final errors</h2>{_as_html(table)}</section>",
             f"<section><h2>Fitting error</h2>{chart}</section>",
             *(self._progress(setting) for setting in settings),
-            f'<section><h2>{legend}</h2><img src="{png_url(maps.read_bytes())}" alt="Error maps"></section>',
+            f'<section><h2>{legend}</h2><img src="{png_url(maps)}" alt="Error maps"></section>',
         ]
-        page = filled(
+        page = plain_page(
             "study.html",
             title=escape(f"{self.capture.name}: bad starts"),
-            style=page_file("report.css"),
             lead="The same photos fitted from several starts.",
             sections="\n".join(sections),
             footer="Lengths are in the capture's unit. Written by structuregs.",
         )
         text = f"# {self.capture.name}: bad starts\n\n{markdown(table)}\n{_BOUND}\n"
-        return [replace_file(self.folder / "robustness.md", text), replace_file(self.folder / "robustness.html", page), maps]
+        files = {"robustness.md": text, "robustness.html": page, "error_maps.png": maps}
+        return [replace_file(self.folder / name, content) for name, content in files.items()]
 
     def _progress(self, setting: Setting) -> str:
         """A row of pictures of the boxes, from the start to the end."""
-        steps = [*(round(share * self.config.steps) for share in _MOMENTS), self.config.steps]
+        steps = [*self._moments(), self.config.steps]
         files = [(step, _picture(self.run(setting), step)) for step in steps]
         shown = "".join(
             f'<figure><img src="{png_url(file.read_bytes())}" alt="step {step}"><figcaption>step {step}</figcaption></figure>'
@@ -191,22 +195,15 @@ _SAYS = {
 }
 
 
-def _write_points(file: Path, points: tuple[Points, Points]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    staged = file.with_name(file.name + ".part")
-    with staged.open("wb") as out:
-        np.savez(out, points_0=points[0], points_1=points[1])
-    staged.replace(file)
+def _as_npz(points: tuple[Points, Points]) -> bytes:
+    """Both states' points as `fit --points` reads them."""
+    memory = io.BytesIO()
+    np.savez(memory, points_0=points[0], points_1=points[1])
+    return memory.getvalue()
 
 
 def _picture(run: Path, step: int) -> Path:
     return run / f"boxes_{step:05d}.png"
-
-
-def _losses(run: Path) -> list[tuple[float, float]]:
-    file = RunFolder(run).metrics
-    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-    return [(float(row["step"]), row["loss"]) for row in rows if (row["loss"] or 0) > 0]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from .assets import replace_file
 from .chart import Point, line_chart
 from .html import opening_camera
 from .overlay import colour_of, draw_structure
-from .page import filled, image_url, page_file, png_url
+from .page import image_url, plain_page, png_url
 from .sweep import render_sweep, telling_order
 
 _CANDIDATES = 12  # views of each state that the shown ones are chosen from
@@ -46,7 +46,7 @@ def write_report(run: Path, capture: Capture, obj: ArticulatedObject, *, notes: 
         views: photos of each state beside their renderings.
     """
     folder = RunFolder(run)
-    metrics = _metrics(folder.metrics)
+    metrics = folder.records()
     seconds = folder.seconds()
     opening = opening_camera(obj, _SWEEP_SIZE)
     sections = [
@@ -56,10 +56,9 @@ def write_report(run: Path, capture: Capture, obj: ArticulatedObject, *, notes: 
         _section("The fit", _timing(metrics, seconds) + _curves(metrics)) if metrics else "",
         _section("Configuration", _settings(json.loads(folder.config.read_text()))) if folder.config.exists() else "",
     ]
-    text = filled(
+    text = plain_page(
         "report.html",
         title=escape(capture.name),
-        style=page_file("report.css"),
         lead=escape(_lead(obj)),
         figures=_figures(capture, obj, metrics, seconds),
         animation=_sweep(obj, opening),
@@ -214,18 +213,19 @@ def _cropped(frames: UInt8[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F h w 3
     return frames[:, spans[0], spans[1]]
 
 
-def _metrics(file: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-
-
 def _timing(metrics: list[dict[str, Any]], seconds: float) -> str:
     steps = metrics[-1]["step"]
     took = f" in {_duration(seconds)}, with all that came before the first ({1000 * seconds / steps:.0f} ms a step)"
     return f'<p class="note">{steps:,} steps{took if seconds else ""}.</p>'
 
 
+def loss_points(metrics: list[dict[str, Any]]) -> list[Point]:
+    """Step and loss of a run's records (`RunFolder.records`), where there is a loss that a logarithm can draw."""
+    return [(float(record["step"]), record["loss"]) for record in metrics if (record["loss"] or 0) > 0]
+
+
 def _curves(metrics: list[dict[str, Any]]) -> str:
-    loss: list[Point] = [(float(record["step"]), record["loss"]) for record in metrics if (record["loss"] or 0) > 0]
+    loss = loss_points(metrics)
     quality: list[Point] = [(float(record["step"]), record["psnr"]) for record in metrics if record["psnr"] is not None]
     charts = []
     if loss:

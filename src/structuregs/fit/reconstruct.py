@@ -8,6 +8,7 @@ from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -81,6 +82,10 @@ class RunFolder:
     def seconds(self) -> float:
         """Seconds spent so far."""
         return json.loads(self.timing.read_text())["total"] if self.timing.exists() else 0.0
+
+    def records(self) -> list[dict[str, Any]]:
+        """The records of `metrics`, step by step; none where it is not there."""
+        return [json.loads(line) for line in self.metrics.read_text().splitlines()] if self.metrics.exists() else []
 
     def cut_metrics(self, step: int) -> None:
         """Drops the records of steps after `step`, which a run that goes on will write again."""

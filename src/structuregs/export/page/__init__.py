@@ -25,6 +25,12 @@ def filled(template: str, **fields: str) -> str:
     return first + "".join(fields[name] + rest for name, _, rest in texts)
 
 
+def plain_page(template: str, *, title: str, **fields: str) -> str:
+    """A page without scripts, in the report's style, whose body is a template of this folder; `title` and fields are HTML."""
+    body = filled(template, title=title, **fields)
+    return filled("plain.html", title=title, style=page_file("report.css"), body=body)
+
+
 def image_url(image: Image.Image, kind: str, **options: Any) -> str:
     """An image as a data URL.
 
