@@ -23,6 +23,7 @@ from structuregs.boxes import (
     survey,
 )
 from structuregs.boxes.appearance import AppearanceConfig
+from structuregs.boxes.divide import FACTORS, divide
 from structuregs.boxes.hypotheses import (
     Hypothesis,
     candidate_motions,
@@ -40,6 +41,7 @@ from structuregs.capture import Capture, TrueJoint
 from structuregs.geometry import SE3, Box, Screw
 from structuregs.joints import kind_of
 from structuregs.model import Splats
+from structuregs.points import points_from
 from structuregs.raster import render
 from structuregs.synthetic import KnownObject, Lighting, RenderOptions, make_capture, make_object
 
@@ -263,7 +265,7 @@ def capture_of(name: str) -> Capture:
 @lru_cache
 def looks_of(name: str) -> tuple[KnownObject, tuple[StateLook, StateLook]]:
     """A known object and the survey of its photos, made once."""
-    return make_object(name), survey(capture_of(name), "hull", SMALL, seed=0)
+    return make_object(name), survey(capture_of(name), None, SMALL, seed=0)
 
 
 @lru_cache
@@ -298,7 +300,7 @@ class TestSurvey:
     def test_given_points_take_the_place_of_its_own(self):
         obj, looks = looks_of("laptop")
         quick = replace(SMALL, appearance=replace(SMALL.appearance, steps=1))
-        given = survey(capture_of("laptop"), "depth", quick, seed=0)
+        given = survey(capture_of("laptop"), points_from(capture_of("laptop"), "depth"), quick, seed=0)
         for state in (0, 1):
             assert float(distance_to_surface(given[state].points, obj, state).max()) < 2e-3
             np.testing.assert_array_equal(given[state].hull.occupied, looks[state].hull.occupied)
@@ -366,7 +368,7 @@ class TestParts:
         # In even light: where a door looks quite another colour once it is open, so few photos do not tell its angle.
         options = RenderOptions(size=200, views=views, test_views=1, samples=2, lighting=Lighting(ambient=0.75))
         config = StartConfig(appearance=AppearanceConfig(steps=300))
-        looks = survey(make_capture(obj, options), "hull", config, seed=0)
+        looks = survey(make_capture(obj, options), None, config, seed=0)
         parts = find_parts(looks, None, config, seed=0)
         assert len(parts) == 2
         for true in obj.joints:
@@ -439,6 +441,72 @@ class TestParts:
         assert found.image_error < scene.judge(start, pieces[0]).image_error
         assert found.oddity == pytest.approx(oddity(found.motion, screen, scene.still), abs=1e-6)
 
+    def test_what_a_splat_takes_off_the_error_adds_up_to_what_the_part_does(self):
+        obj, looks = looks_of("laptop")
+        look = looks[0]
+        screen = obj.parts[1].boxes[0].box
+        inside = Box(screen.T_world_box, screen.half_extents + 0.03).contains(look.splats.means.double())
+        part, scene = look.splats[inside], Scene(look, look.splats[~inside], np.arange(0, 16, 2), KDTree(look.points))
+        here, lifted = SE3.identity(1, dtype=F64), slides_by([[0.0, 0.0, 0.5]])
+        support = scene.support(part, SE3(torch.cat([here.wxyz_xyz, lifted.wxyz_xyz])))
+        assert support.shape == (2, len(part))
+        pixels = look.stack.alpha[scene.views].size
+        for row, motion in zip(support, (here, lifted), strict=True):
+            fall = scene.absent(part) - scene.error(part, motion[0])
+            assert row.sum() / pixels == pytest.approx(fall, rel=0.1)
+        assert support[0].sum() > 0 > support[1].sum()
+        assert (support[0] > 0).mean() > 0.7
+
+    def test_two_doors_on_one_line_that_open_differently_are_two_parts(self):
+        obj = make_object("fridge")
+        config = StartConfig(appearance=AppearanceConfig(steps=300))
+        looks = survey(make_capture(obj, RenderOptions(size=128, views=32, test_views=1, samples=2)), None, config, seed=0)
+        parts = find_parts(looks, None, config, seed=0)
+        assert len(parts) == 2
+        for true in obj.joints:
+            assert min(errors(part.motion, part.points_in(0), true)[0] for part in parts) < 4
+
+
+class TestDivide:
+    """Two boards side by side, the left of which would rather go .6 of the way."""
+
+    @staticmethod
+    def boards() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points, centres of splats, and which of both are the left board's."""
+        generator = np.random.default_rng(0)
+        points, means = (generator.uniform([-1, -0.02, 0], [1, 0.02, 1], (n, 3)) for n in (3000, 400))
+        return points, means, means[:, 0] < 0
+
+    @staticmethod
+    def support(means: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Highest at each splat's own factor, and noise."""
+        factors = np.array(FACTORS)[:, None]
+        return 1 - 5 * np.abs(factors - wanted) + 0.2 * np.random.default_rng(1).standard_normal((len(factors), len(means)))
+
+    def pieces(self, left: float, *, least: float = 0.0) -> list[np.ndarray]:
+        points, means, is_left = self.boards()
+        support = self.support(means, np.where(is_left, left, 1.0))
+        return divide(points, means, support, 1.6, least, CueConfig(), voxel=0.05)
+
+    def test_boards_that_want_different_ways_are_parted_where_they_meet(self):
+        pieces = self.pieces(0.6)
+        assert len(pieces) == 2
+        assert sum(map(len, pieces)) == 3000
+        for piece, side in zip(sorted(pieces, key=lambda p: p[:, 0].mean()), (-1, 1), strict=True):
+            assert (side * piece[:, 0] > -0.1).all()
+            assert abs(len(piece) - 1500) < 150
+
+    def test_one_way_is_one_part(self):
+        (piece,) = self.pieces(1.0)
+        assert len(piece) == 3000
+
+    def test_too_little_to_gain_is_one_part(self):
+        assert len(self.pieces(0.6, least=1e3)) == 1
+
+    def test_what_no_factor_suits_is_left_whole(self):
+        points, means, _ = self.boards()
+        assert len(divide(points, means, np.full((len(FACTORS), len(means)), -1.0), 1.6, 0.0, CueConfig(), voxel=0.05)) == 1
+
 
 class TestBoxesOfParts:
     @pytest.mark.parametrize("name", ["laptop", "drawer"])
@@ -470,7 +538,7 @@ class TestBoxesOfParts:
 def test_a_survey_of_the_same_seed_is_the_same():
     capture = make_capture(make_object("slider"), RenderOptions(size=64, views=6, test_views=1, samples=1))
     quick = replace(SMALL, appearance=replace(SMALL.appearance, steps=20, size=48), voxels=32)
-    first, again, other = (survey(capture, "hull", quick, seed=seed) for seed in (1, 1, 2))
+    first, again, other = (survey(capture, None, quick, seed=seed) for seed in (1, 1, 2))
     assert torch.equal(first[0].splats.means, again[0].splats.means)
     assert np.array_equal(first[1].points, again[1].points)
     assert not torch.equal(first[0].splats.means[:100], other[0].splats.means[:100])

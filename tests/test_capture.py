@@ -21,8 +21,10 @@ from structuregs.capture import (
     load_truth,
     save_capture,
     save_truth,
+    spread_cameras,
 )
 from structuregs.geometry import SE3, Camera
+from structuregs.synthetic import RenderOptions, make_object, orbit
 
 WIDTH, HEIGHT = 10, 8
 K = [[100.0, 0, 5.0], [0, 100.0, 4.0], [0, 0, 1.0]]
@@ -198,6 +200,16 @@ def test_farthest_points_take_the_outliers_before_the_crowd():
     crowd = np.random.default_rng(0).normal(scale=0.01, size=(20, 3))
     outliers = np.array([[5.0, 0, 0], [0, 4.0, 0], [0, 0, 3.0]])
     assert farthest_points(np.concatenate([crowd, outliers]), 4, first=7) == [7, 20, 21, 22]
+
+
+@pytest.mark.parametrize("count", [5, 16])
+def test_a_few_cameras_of_a_spiral_look_from_all_sides(count: int):
+    cameras = orbit(make_object("laptop"), 40, RenderOptions(elevation_deg=(0.0, 60.0)))
+    few = spread_cameras(cameras, count)
+    assert len(set(few)) == count
+    azimuths = np.sort([math.degrees(math.atan2(*cameras[i].centre[:2].tolist())) for i in few])
+    assert np.diff(azimuths, append=azimuths[0] + 360).max() < 130
+    assert spread_cameras(cameras[:3], count) == spread_cameras(cameras[:3], 3)
 
 
 def test_a_subset_of_views_is_spread_seeded_and_leaves_the_test_views(tmp_path):

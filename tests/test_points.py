@@ -1,16 +1,19 @@
 import math
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import KDTree
 
-from structuregs.capture import Capture, CaptureError
+from structuregs.capture import Capture, CaptureError, View
 from structuregs.geometry import SE3, Box, Camera
-from structuregs.points import Hull, Silhouettes, object_bounds, points_from
+from structuregs.points import Hull, Silhouettes, align_cameras, object_bounds, points_from
 from structuregs.synthetic import RenderOptions, make_capture, make_object
 
 SIZE = 96
@@ -166,7 +169,7 @@ class TestDepthClouds:
         clouds = points_from(laptop, "depth")
         assert clouds is not None
         obj = make_object("laptop")
-        for state, cloud in enumerate(clouds):
+        for state, cloud in enumerate(clouds.points):
             assert len(cloud) > 1000
             distances = []
             for item in (item for part in obj.parts for item in part.at_state(state)):
@@ -193,8 +196,8 @@ class TestFiles:
         np.savez(tmp_path / "points.npz", points_0=first, points_1=second)
         read = points_from(laptop, str(tmp_path / "points.npz"))
         assert read is not None
-        np.testing.assert_array_equal(read[0], first)
-        np.testing.assert_array_equal(read[1], second.astype(np.float64))
+        np.testing.assert_array_equal(read.points[0], first)
+        np.testing.assert_array_equal(read.points[1], second.astype(np.float64))
 
     def test_ply_round_trip(self, laptop: Capture, tmp_path: Path):
         for state in (0, 1):
@@ -202,7 +205,7 @@ class TestFiles:
         read = points_from(laptop, str(tmp_path / "s{state}.ply"))
         assert read is not None
         for state in (0, 1):
-            np.testing.assert_allclose(read[state], cloud(120 + state, state), atol=1e-6)
+            np.testing.assert_allclose(read.points[state], cloud(120 + state, state), atol=1e-6)
 
     def test_a_mesh_s_ply_gives_its_vertices(self, laptop: Capture, tmp_path: Path):
         ball = trimesh.creation.icosphere(subdivisions=3)
@@ -210,20 +213,20 @@ class TestFiles:
             ball.export(tmp_path / f"s{state}.ply")
         read = points_from(laptop, str(tmp_path / "s{state}.ply"))
         assert read is not None
-        np.testing.assert_allclose(np.linalg.norm(read[0], axis=1), 1, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(read.points[0], axis=1), 1, atol=1e-6)
 
     def test_a_huge_cloud_is_thinned_evenly(self, laptop: Capture, tmp_path: Path):
         line = np.linspace(0, 1, 200_000)[:, None].repeat(3, 1)
         np.savez(tmp_path / "points.npz", points_0=line, points_1=line[:500])
         read = points_from(laptop, str(tmp_path / "points.npz"))
         assert read is not None
-        assert 20_000 < len(read[0]) <= 50_000
-        assert np.ptp(np.diff(read[0][:, 0])) < 1e-9
-        assert len(read[1]) == 500
+        assert 20_000 < len(read.points[0]) <= 50_000
+        assert np.ptp(np.diff(read.points[0][:, 0])) < 1e-9
+        assert len(read.points[1]) == 500
 
     @pytest.mark.parametrize("source", ["cloud.txt", "one.ply", "hul"])
     def test_an_unknown_source_names_the_choices(self, laptop: Capture, source: str):
-        with pytest.raises(CaptureError, match=rf"^--points {source}: give hull, depth, a file FILE\.npz, or"):
+        with pytest.raises(CaptureError, match=rf"^--points {source}: give hull, depth, vggt, pi3, a file FILE\.npz, or"):
             points_from(laptop, source)
 
     @pytest.mark.parametrize(
@@ -272,6 +275,161 @@ class TestFiles:
         (tmp_path / "s0.ply").write_text("hello\nworld\n")
         with pytest.raises(CaptureError, match=r"s0\.ply: not a PLY file"):
             points_from(laptop, str(tmp_path / "s{state}.ply"))
+
+
+def poses_of(cameras: Sequence[Camera]) -> SE3:
+    return SE3(torch.stack([camera.T_world_camera.wxyz_xyz for camera in cameras]).double())
+
+
+def in_its_own_frame(poses: SE3) -> tuple[SE3, SE3, float]:
+    """The poses in a frame that is turned, shifted and 2.5 times as small; the motion and the scale that lead back."""
+    T, scale = SE3.exp(torch.tensor([0.3, -1.0, 0.5, 0.8, -0.5, 1.9], dtype=torch.float64)), 2.5
+    away = T.inverse() @ poses
+    return SE3.from_quat(away.wxyz, away.xyz / scale), T, scale
+
+
+class TestCameras:
+    def test_are_laid_upon_each_other(self):
+        poses = poses_of(CAMERAS)
+        away, T, scale = in_its_own_frame(poses)
+        alignment = align_cameras(away, poses)
+        points = cloud(120, 0)
+        expected = T.apply(torch.from_numpy(points * scale)).numpy()
+        np.testing.assert_allclose(alignment.similarity.apply(points), expected, atol=1e-6)
+        assert alignment.angle_deg < 1e-4
+        assert alignment.distance < 1e-6
+
+    def test_though_a_third_of_them_are_wrong(self):
+        poses = poses_of(CAMERAS)
+        away, T, scale = in_its_own_frame(poses)
+        generator = torch.Generator().manual_seed(0)
+        wrong = SE3.exp(torch.randn(len(CAMERAS), 6, generator=generator, dtype=torch.float64))
+        blunders = torch.arange(len(CAMERAS)) % 3 == 0
+        mixed = SE3(torch.where(blunders[:, None], (wrong @ away).wxyz_xyz, away.wxyz_xyz))
+        alignment = align_cameras(mixed, poses)
+        expected = T.apply(torch.from_numpy(cloud(120, 0) * scale)).numpy()
+        np.testing.assert_allclose(alignment.similarity.apply(cloud(120, 0)), expected, atol=0.01)
+
+    def test_in_one_place_tell_no_scale(self):
+        poses = poses_of(CAMERAS)
+        here = SE3.from_quat(poses.wxyz, torch.zeros_like(poses.xyz))
+        with pytest.raises(ValueError, match="do not tell a scale"):
+            align_cameras(here, poses)
+
+
+class StandIn:
+    """A model that knows the truth, but for noise: it finds the shown images among a capture's views."""
+
+    def __init__(self, capture: Capture, side: int, noise: float):
+        self.capture, self.side, self.noise = capture, side, noise
+
+    def from_pretrained(self, weights: str) -> "StandIn":
+        self.weights = weights
+        return self
+
+    def to(self, device: torch.device) -> "StandIn":
+        assert device.type in ("cpu", "cuda")
+        return self
+
+    def eval(self) -> "StandIn":
+        return self
+
+    def views(self, images: torch.Tensor) -> list[View]:
+        """The views of the images, whose order and state the model is not told."""
+        assert images.shape[0] == 1
+        assert images.shape[2:] == (3, self.side, self.side)
+        known = [view for state in self.capture.train for view in state]
+        blank = {id(view): torch.from_numpy(view.image(self.side, self.side)[0]).permute(2, 0, 1) for view in known}
+        return [min(known, key=lambda view: float((blank[id(view)] - image).abs().mean())) for image in images[0].cpu()]
+
+    def depth(self, view: View) -> torch.Tensor:
+        assert view.depth is not None
+        index = torch.arange(self.side) * view.camera.width // self.side
+        depth = torch.from_numpy(view.depth)[index[:, None], index]
+        return depth * (1 + self.noise * torch.randn(depth.shape, generator=torch.Generator().manual_seed(0)))
+
+
+class Vggt(StandIn):
+    def __call__(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        views = self.views(images)
+        away, _, scale = in_its_own_frame(poses_of([view.camera for view in views]))
+        depth = torch.stack([self.depth(view) for view in views]) / scale
+        return {"pose_enc": away.inverse().wxyz_xyz[None], "depth": depth[None, ..., None], "depth_conf": depth[None]}
+
+
+class Pi3(StandIn):
+    def __call__(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        views = self.views(images)
+        cameras = [view.camera.resized(self.side, self.side) for view in views]
+        away, T, scale = in_its_own_frame(poses_of(cameras))
+        rows = [(camera.rays(), self.depth(view)) for camera, view in zip(cameras, views, strict=True)]
+        world = torch.stack([origin + rays * depth[..., None] for (origin, rays), depth in rows])
+        points = T.inverse().apply(world.double()) / scale
+        sure = torch.ones(1, len(views), self.side, self.side, 1)
+        return {"points": points[None].float(), "camera_poses": away.as_matrix()[None], "conf": sure, "more": None}  # pyright: ignore
+
+
+def install(monkeypatch: pytest.MonkeyPatch, **modules: dict[str, object]) -> None:
+    """Modules of these names (with __ for dots) and contents."""
+    for name, contents in modules.items():
+        module = ModuleType(name.replace("__", "."))
+        vars(module).update(contents)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+def install_stand_in(monkeypatch: pytest.MonkeyPatch, name: str, capture: Capture, noise: float) -> StandIn:
+    """Packages of the estimators' names and interfaces, as their READMEs have them."""
+    focal = capture.train[0][0].camera.fx / capture.train[0][0].camera.width
+
+    def decode(pose: torch.Tensor, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+        K = torch.tensor([[focal * size[1], 0, size[1] / 2], [0, focal * size[0], size[0] / 2], [0, 0, 1]])
+        return SE3(pose).as_matrix()[..., :3, :], K.expand(*pose.shape[:2], 3, 3)
+
+    def unproject(depth: torch.Tensor, extrinsics: torch.Tensor, intrinsics: torch.Tensor) -> np.ndarray:
+        rows = []
+        for z, E, K in zip(depth[..., 0], extrinsics, intrinsics, strict=True):
+            pose = SE3.from_rotation(E[:, :3], E[:, 3]).inverse()
+            camera = Camera(pose, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), z.shape[1], z.shape[0])
+            origin, rays = camera.rays()
+            rows.append(origin + rays * z[..., None])
+        return torch.stack(rows).numpy()
+
+    if name == "vggt":
+        model = Vggt(capture, 518, noise)
+        install(monkeypatch, vggt={}, vggt__models={}, vggt__models__vggt={"VGGT": model}, vggt__utils={})
+        install(monkeypatch, vggt__utils__pose_enc={"pose_encoding_to_extri_intri": decode})
+        install(monkeypatch, vggt__utils__geometry={"unproject_depth_map_to_point_map": unproject})
+    else:
+        model = Pi3(capture, 504, noise)
+        install(monkeypatch, pi3={}, pi3__models={}, pi3__models__pi3={"Pi3": model})
+    return model
+
+
+@pytest.mark.parametrize("name", ["vggt", "pi3"])
+class TestEstimators:
+    def test_points_come_to_lie_on_the_object(self, name: str, laptop: Capture, monkeypatch: pytest.MonkeyPatch):
+        model = install_stand_in(monkeypatch, name, laptop, noise=0.002)
+        found, true = points_from(laptop, name), points_from(laptop, "depth")
+        assert found is not None
+        assert true is not None
+        for state in (0, 1):
+            away = KDTree(true.points[state]).query(found.points[state])[0]
+            assert np.quantile(away, 0.9) < 0.05
+            assert np.median(away) < 0.02
+        assert model.weights in " ".join(found.says)
+        assert "0.00 degrees" in found.says[1]
+
+    def test_cameras_that_disagree_are_refused(self, name: str, laptop: Capture, monkeypatch: pytest.MonkeyPatch):
+        model = install_stand_in(monkeypatch, name, laptop, noise=0.0)
+        shown = model.views
+        monkeypatch.setattr(model, "views", lambda images: shown(images)[::-1])
+        with pytest.raises(CaptureError, match=rf"--points {name}, state 0: its cameras agree .* only to .* use --points hull"):
+            points_from(laptop, name)
+
+    def test_a_missing_package_says_how_to_get_it(self, name: str, laptop: Capture, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setitem(sys.modules, name, None)
+        with pytest.raises(CaptureError, match=r"pip install .*git\+https.*CC BY-NC 4.0"):
+            points_from(laptop, name)
 
 
 def _npy(array: np.ndarray) -> bytes:

@@ -43,7 +43,7 @@ def study(
 
 
 def test_perturbed_points_are_what_their_names_say(slider: Capture):
-    looks = survey(slider, "hull", TINY.start, seed=0)
+    looks = survey(slider, None, TINY.start, seed=0)
     cue = CueConfig()
     voxel = looks[0].hull.voxel
     rows = perturbed_points(looks, cue, seed=0)

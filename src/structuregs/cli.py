@@ -50,7 +50,8 @@ def fit(
         views: Use this many views of each state, spread over the cameras. Default: all.
         parts: Number of moving parts. Default: estimated.
         seed: The same seed gives the same bytes on a CPU.
-        points: Where the first points come from: hull (masks), depth (the capture's depth maps), or a file.
+        points: Where the first points come from: hull (masks), depth (the capture's depth maps), vggt or pi3
+            (pretrained models that you install), or a file.
         device: Where to compute.
         view: Show the object in the browser while it is fitted.
     """

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float64
 from scipy import ndimage
 from torch import Tensor
 
-from ..capture import ImageStack
+from ..capture import ImageStack, spread_cameras
 from ..model import Splats
 from ..points import Hull
 from ..raster import image_loss, render
@@ -76,10 +76,10 @@ def surface_points(splats: Splats, stack: ImageStack, hull: Hull, looks: int) ->
         splats: of one state, in the world.
         stack: its views.
         hull: its hull; points are sorted into these voxels, and those outside it are dropped.
-        looks: how many views to read, evenly over the stack.
+        looks: how many views to read, well apart.
     """
     hits = []
-    for v in np.unique(np.linspace(0, len(stack) - 1, min(looks, len(stack))).round().astype(int)):
+    for v in spread_cameras(stack.cameras, looks):
         picture = render(splats, stack.cameras[v])
         origin, rays = stack.cameras[v].rays()
         # Where depth jumps from one pixel to the next, its mean lies in the air between.

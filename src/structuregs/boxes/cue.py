@@ -80,14 +80,19 @@ def clusters(looks: tuple[StateLook, StateLook], config: CueConfig) -> list[Clus
         other = looks[1 - state]
         voxel = other.hull.voxel
         moving = look.points[moving_points(look.points, other, config.threshold * voxel)]
-        if len(moving) < config.neighbours:
-            continue
-        labels = DBSCAN(eps=config.link * voxel, min_samples=config.neighbours).fit_predict(moving)
-        for label in range(labels.max() + 1):
-            least = max(config.smallest * len(look.points), 2.0 * config.neighbours)
-            pieces = split_where_hollow(moving[labels == label], 0.5 * voxel, config.hollow)
-            found += [Cluster(state, piece) for piece in pieces if len(piece) >= least]
+        for whole in linked(moving, config, voxel):
+            pieces = split_where_hollow(whole, 0.5 * voxel, config.hollow)
+            found += [Cluster(state, piece) for piece in pieces if len(piece) >= config.smallest * len(look.points)]
     return sorted(found, key=lambda cluster: -len(cluster.points))
+
+
+def linked(points: Float64[np.ndarray, "P 3"], config: CueConfig, voxel: float) -> list[Float64[np.ndarray, "_ 3"]]:
+    """The points in pieces that hang together, without those that lie alone and pieces of a few points (DBSCAN)."""
+    if len(points) < config.neighbours:
+        return []
+    labels = DBSCAN(eps=config.link * voxel, min_samples=config.neighbours).fit_predict(points)
+    pieces = [points[labels == label] for label in range(labels.max() + 1)]
+    return [piece for piece in pieces if len(piece) >= 2 * config.neighbours]
 
 
 def split_where_hollow(points: Float64[np.ndarray, "P 3"], thinnest: float, ratio: float) -> list[Float64[np.ndarray, "_ 3"]]:

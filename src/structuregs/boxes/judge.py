@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float64, Int64
 from scipy.optimize import minimize_scalar
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -12,10 +12,11 @@ from torch import Tensor
 from ..geometry import SE3, Box, screw_at
 from ..joints import kind_of
 from ..model import SH_C0, Splats
-from ..raster import image_loss, render
+from ..raster import Render, image_loss, render
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
+_ALPHA_WEIGHT = 0.5  # of the mask's error beside the colour's
 _FEW = 5  # photos that do for a quick look
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
@@ -27,7 +28,7 @@ class Scene:
     Attributes:
         look: the photos' state.
         rest: splats of all the rest, in the world.
-        views: which photos judge; a few of them do for a quick look.
+        views: which photos judge; the first few of them do for a quick look.
         still: points of what stands still, in the world.
     """
 
@@ -41,13 +42,13 @@ class Scene:
         stack = self.look.stack
         rgb, alpha = stack.target(v)
         picture = render(Splats.concatenate([self.rest, part]), stack.cameras[v])
-        return image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=0.5)
+        return image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=_ALPHA_WEIGHT)
 
     @torch.no_grad()
     def error(self, part: Splats, motion: SE3, quick: bool = False) -> float:
         """Mean error of the judging photos with the part moved."""
         moved = part.moved(motion)
-        views = self.views[:: max(len(self.views) // _FEW, 1)] if quick else self.views
+        views = self.views[:_FEW] if quick else self.views
         return float(np.mean([float(self.loss(moved, int(v))) for v in views]))
 
     @torch.no_grad()
@@ -67,6 +68,26 @@ class Scene:
             np.mean([float(render(marked, self.look.stack.cameras[v], background=black).rgb.mean()) for v in self.views])
         )
 
+    def support(self, part: Splats, motions: SE3) -> Float64[np.ndarray, "M N"]:
+        """What each splat of a part takes off the photos' error under each of M motions of the part.
+
+        The fall of a pixel's error against the picture without the part, shared out among the splats by how much of the
+        pixel each of them paints; summed over the pixels of the judging photos.
+        """
+        rows = np.zeros((len(motions.wxyz_xyz), len(part)))
+        for v in self.views.tolist():
+            camera, target = self.look.stack.cameras[v], self.look.stack.target(v)
+            with torch.no_grad():
+                without = _errors(render(self.rest, camera), *target)
+            for m, row in enumerate(rows):
+                both = Splats.concatenate([self.rest, part.moved(motions[m])])
+                sh = both.sh.requires_grad_()
+                picture = render(replace(both, sh=sh), camera)
+                fall = (without - _errors(picture, *target)).detach()
+                painted = torch.autograd.grad(picture.rgb, sh, fall[..., None].expand_as(picture.rgb) / 3)[0]
+                row += painted[len(self.rest) :, 0].sum(-1).double().numpy() / SH_C0
+        return rows
+
     def judge(self, hypothesis: Hypothesis, part: Splats, quick: bool = False) -> Hypothesis:
         """The hypothesis with its image error."""
         return replace(hypothesis, image_error=self.error(part, hypothesis.motion, quick))
@@ -74,6 +95,11 @@ class Scene:
     def moved(self, hypothesis: Hypothesis, motion: SE3, box: Box) -> Hypothesis:
         """The hypothesis with another motion of its box; what masks and photos say is still that of the old one."""
         return replace(hypothesis, motion=motion, oddity=oddity(motion, box, self.still))
+
+
+def _errors(picture: Render, rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """What `Scene.loss` is the mean of."""
+    return (picture.rgb - rgb).abs().mean(-1) + _ALPHA_WEIGHT * (picture.alpha - alpha).abs()
 
 
 def refine(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, steps: int, rate: float) -> Hypothesis:

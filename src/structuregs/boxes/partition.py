@@ -10,9 +10,12 @@ from jaxtyping import Bool, Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..geometry import SE3, Box
+from ..capture import spread_cameras
+from ..geometry import SE3, Box, screw_at
+from ..joints import kind_of
 from ..model import Splats
 from .cue import Cluster, CueConfig, StateLook, box_around, clusters
+from .divide import FACTORS, divide
 from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, flips, hull_scores, oddity, stack_motions
 from .judge import NOISE, Scene, measured, refine, simplest
 
@@ -25,6 +28,11 @@ class SearchConfig:
     """The motion cue."""
     most: int = 12
     """Clusters that are looked at, the largest first, of twice as many."""
+    mixed: float = 1.6
+    """A cluster holds several parts if its splats, each with as much or as little of the motion as suits it, would take this
+    many times as much off the photos' error as with one motion for all; of single parts it is .95 to 1.25 times..."""
+    divided: float = 0.06
+    """...and by more than this share of the cluster's weight: what hardly shows in the other state says nothing."""
     together: int = 3
     """A part may show as several clusters of a state: the boxes of so many with any one are laid upon the other state's."""
     there: float = 0.12
@@ -42,12 +50,12 @@ class SearchConfig:
     """Optimiser steps for each finalist."""
     rate: float = 0.03
     """Of a finalist's pose: radians, and parts of the box's half diagonal."""
-    same: float = 0.3
+    same: float = 0.15
     """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
-    alike: float = 0.25
-    """...and if moving it like the other costs the photos less than this fraction of the part's weight."""
-    shown: float = 0.1
-    """Clusters are moved along with another if the photos of the other state then show this share of their weight."""
+    alike: float = 0.12
+    """...and if moving it just like the other costs the photos less than this fraction of the part's weight."""
+    shown: float = 0.2
+    """Clusters are moved together if the photos of the other state then show this share of the weight of each."""
     large: float = 0.01
     """A part that holds this fraction of its state's points came from somewhere: it is kept if it does little harm..."""
     harm: float = 0.01
@@ -101,11 +109,14 @@ class PartSearch:
         found = clusters(looks, config.cue)
         still = self._still_points(found)
         self.base_box, self.still = self._box(still), KDTree(still)
+        moving = [[cluster.points for cluster in found if cluster.state == state] for state in (0, 1)]
+        self.moving = [KDTree(np.concatenate([np.zeros((0, 3)), *points])) for points in moving]
         # Of each cluster: its box, its splats among its state's, and what the photos of its state lose without it.
         self.clusters: list[Cluster] = []
         self.boxes: list[Box] = []
         self.held: list[Bool[Tensor, " N"]] = []
         self.weights: list[float] = []
+        self.apart: dict[int, int] = {}  # clusters that were one but do not move together, with that one's index
         for cluster in found[: 2 * config.most]:
             if len(self.clusters) < config.most:
                 self._take(cluster)
@@ -137,21 +148,43 @@ class PartSearch:
             self.held.append(held)
             self.weights.append(weight)
 
+    def _divided(self, part: MovingPart, members: set[int], parts: list[MovingPart]) -> list[int]:
+        """Indices of new clusters in place of those of a part, if these turn out to be several parts; none otherwise."""
+        box = self._box(part.points)
+        screw, q = screw_at(part.hypothesis.motion, kind_of(part.hypothesis.motion), box.T_world_box.xyz)
+        piece = self._piece(members)
+        scene = self._scene(1 - part.state, self._rest(parts, part.state))
+        support = scene.support(piece, screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64)))
+        means = piece.means.double().numpy()
+        least = self.config.divided * part.weight * scene.look.stack.alpha[scene.views].size
+        pieces = divide(part.points, means, support, self.config.mixed, least, self.config.cue, self.voxel)
+        before = len(self.clusters)
+        if len(pieces) > 1:
+            for points in sorted(pieces, key=len, reverse=True):
+                self._take(Cluster(part.state, points))
+            origin = self.apart.get(min(members), min(members))
+            self.apart |= dict.fromkeys(range(before, len(self.clusters)), origin)
+        return list(range(before, len(self.clusters)))
+
     def _splats_of(self, part: MovingPart) -> Splats:
         """A part's splats in its own state: its pieces', as one box around all may hold some of the base."""
         held = [self._held(points, part.state) for points in part.pieces]
         return self.looks[part.state].splats[torch.stack(held).any(0)]
 
     def _held(self, points: Float64[np.ndarray, "P 3"], state: int) -> Bool[Tensor, " N"]:
-        """Which splats of a state lie in the box of points or near it."""
+        """Which splats of a state lie in the box of points or near it, and no nearer to what else moved."""
         means = self.looks[state].splats.means.double()
-        return self._box(points).contains(means, margin=self.config.clear * self.voxel)
+        held = self._box(points).contains(means, margin=self.config.clear * self.voxel)
+        inside = means[held].numpy()
+        held[held.clone()] = torch.from_numpy(
+            KDTree(points).query(inside)[0] < self.moving[state].query(inside)[0] + 0.5 * self.voxel
+        )
+        return held
 
     def _scene(self, state: int, rest: Splats) -> Scene:
         """A state's photos, evenly spread, as judges of a part among all the rest."""
-        count = len(self.looks[state].stack)
-        views = np.unique(np.linspace(0, count - 1, min(self.config.looks, count)).round().astype(int))
-        return Scene(self.looks[state], rest, views, self.still)
+        views = spread_cameras(self.looks[state].stack.cameras, self.config.looks)
+        return Scene(self.looks[state], rest, np.array(views), self.still)
 
     def search(self, count: int | None) -> list[MovingPart]:
         """The moving parts with the motions that the photos prefer: all that explain something, or the `count` best."""
@@ -167,11 +200,18 @@ class PartSearch:
         parts: list[MovingPart] = []
         explained: set[int] = set()
         refused: dict[int, tuple[int, float]] = {}
-        for index in range(len(self.clusters)):
-            yield index
+        count = len(self.clusters)
+        todo = list(range(count))
+        while todo:
+            index = todo.pop(0)
+            yield min(index, count)
             if index in explained:
                 continue
             part, members = self._try(index, parts, explained)
+            if pieces := self._divided(part, members, parts):
+                explained |= members
+                todo = pieces + todo
+                continue
             share = len(part.points) / len(self.looks[part.state].points)
             large = share > self.config.large
             if part.gain < (-self.config.harm if large else NOISE):
@@ -199,10 +239,10 @@ class PartSearch:
             again = [self._pulled(h, scene, piece, box, absent, part.weight, self.config.steps) for h in starts]
             by_cost = sorted(again, key=lambda h: h.cost(part.weight))
             gaps = displacements(stack_motions(shared), by_cost[0].motion, box)
-            losses = np.array([h.image_error for h in again[-len(shared) :]]) - min(h.image_error for h in again)
+            as_they_move = np.array([scene.error(piece, T) for T in shared])
+            losses = as_they_move - min(h.image_error for h in again)
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
             # A piece that touches a weightier part, and has no better motion of its own than that part's, belongs to it.
-            as_they_move = np.array([scene.error(piece, T) for T in shared])
             needless = as_they_move < min(h.cost(part.weight) for h in again[: -len(shared)])
             alike |= needless & np.array([other.weight > part.weight and self._touch(part, other) for other in others])
 
@@ -294,7 +334,7 @@ class PartSearch:
         target = self.looks[other]
         open_ = [i for i in range(len(self.clusters)) if i not in done]
         arrivals = [i for i in open_ if self.clusters[i].state == other]
-        siblings = [i for i in open_ if self.clusters[i].state == state and i != index]
+        siblings = [i for i in open_ if self.clusters[i].state == state and i != index and not self._known_apart(i, index)]
         wholes = self._unions(siblings, {index})
         pairs = list(itertools.product(wholes, self._unions(arrivals, set())))
         motions = candidate_motions(wholes, self.base_box, pairs)
@@ -325,7 +365,9 @@ class PartSearch:
                 joined = scene.judge(start, self._piece({index, *together}), quick=True)
                 share = self.config.shown * sum(self.weights[i] for i in together)
                 if joined.image_error < alone.image_error - share:
-                    judged.append((joined, together))
+                    others = scene.error(self._piece(set(together)), motion, quick=True)
+                    if joined.image_error < others - self.config.shown * self.weights[index]:
+                        judged.append((joined, together))
         weight = self.weights[index]
         refined = []
         for start, group in self._finalists(judged, box, weight):
@@ -335,11 +377,20 @@ class PartSearch:
         chosen = distinct(stack_motions([h.motion for h, _ in refined]), box, 0.1, len(refined))
         refined = [refined[c] for c in chosen]
         best, group = refined[0]
-        members = {index, *group}
+        members = {index, *self._shown(best, index, group, scene)}
         best = measured(best, scene, self._piece(members), box)
         pieces = tuple(self.clusters[i].points for i in sorted(members))
         gain = (absent - best.image_error) / absent
         return MovingPart(state, pieces, best, gain, weight, tuple(rival for rival, _ in refined[1:])), members
+
+    def _shown(self, best: Hypothesis, index: int, group: frozenset[int], scene: Scene) -> set[int]:
+        """The clusters of a group that the photos miss if they do not move along."""
+        everything = scene.error(self._piece({index, *group}), best.motion)
+        without = {i: scene.error(self._piece({index, *group} - {i}), best.motion) for i in group}
+        return {i for i, error in without.items() if error - everything > self.config.shown * self.weights[i]}
+
+    def _known_apart(self, one: int, other: int) -> bool:
+        return one in self.apart and self.apart[one] == self.apart.get(other)
 
     def _unions(self, indices: list[int], always: set[int]) -> list[Box]:
         """Boxes of what may be one part: the clusters in `always` with none, one, two or all of the largest others."""

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from ..capture import Capture, stack_views
 from ..geometry import SE3, Box
-from ..points import Silhouettes, object_bounds, points_from
+from ..points import Clouds, Silhouettes, object_bounds
 from .appearance import AppearanceConfig, fit_state, surface_points
 from .cue import StateLook, box_around, clusters
 from .partition import MovingPart, PartSearch, SearchConfig
@@ -31,30 +31,29 @@ class StartConfig:
     """The search for motions."""
 
 
-def look_at_states(capture: Capture, source: str, config: StartConfig, seed: int) -> Iterator[StateLook]:
+def look_at_states(capture: Capture, given: Clouds | None, config: StartConfig, seed: int) -> Iterator[StateLook]:
     """Hull, quick look and surface points of state 0, then of state 1.
 
     Args:
         capture: its training views are used.
-        source: where the points come from: "hull", "depth" or a file (see `points.points_from`).
+        given: points from elsewhere (see `points.points_from`); None to read them off the quick looks.
         config: sizes.
         seed: of the splats' places.
     """
     stacks = [stack_views(views, config.mask_size) for views in capture.train]
     silhouettes = tuple(Silhouettes(stack.cameras, stack.alpha.astype(np.float32) / 255) for stack in stacks)
     low, high = object_bounds(silhouettes)
-    given = points_from(capture, source)
     for state, views in enumerate(capture.train):
         hull = silhouettes[state].carve(low, high, config.voxels)
         stack = stack_views(views, config.appearance.size)
         splats = fit_state(stack, hull, config.appearance, seed)
-        points = given[state] if given else surface_points(splats, stack, hull, config.appearance.looks)
+        points = given.points[state] if given else surface_points(splats, stack, hull, config.appearance.looks)
         yield StateLook(stack, hull, points, splats)
 
 
-def survey(capture: Capture, source: str, config: StartConfig, seed: int) -> tuple[StateLook, StateLook]:
+def survey(capture: Capture, given: Clouds | None, config: StartConfig, seed: int) -> tuple[StateLook, StateLook]:
     """Both of `look_at_states`, with its arguments."""
-    first, second = look_at_states(capture, source, config, seed)
+    first, second = look_at_states(capture, given, config, seed)
     return first, second
 
 

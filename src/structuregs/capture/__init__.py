@@ -3,7 +3,8 @@
 from .capture import Capture, View
 from .errors import CaptureError
 from .layouts import Layout, find_captures
-from .read import farthest_points, load_capture
+from .read import load_capture
+from .spread import farthest_points, spread_cameras
 from .stack import ImageStack, stack_views
 from .truth import TrueJoint, Truth, find_truth, load_truth
 from .write import TrueMesh, save_capture, save_truth
@@ -24,5 +25,6 @@ __all__ = [
     "load_truth",
     "save_capture",
     "save_truth",
+    "spread_cameras",
     "stack_views",
 ]

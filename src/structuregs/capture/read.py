@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float64, UInt8
 from PIL import Image
 
 from ..geometry import SE3, Camera
 from .capture import Capture, View
 from .errors import CaptureError
 from .layouts import STATES, Frame, Layout, Split, find_layout, list_frames
+from .spread import farthest_points
 
 FEWEST_VIEWS = 3
 _ROTATION_TOLERANCE = 1e-3  # of R^T R - I; real captures round their poses
@@ -76,16 +77,6 @@ def camera_of_opengl(
 def opengl_of_camera(camera: Camera) -> Float64[np.ndarray, "4 4"]:
     """The camera-to-world matrix with OpenGL axes, as capture folders hold it."""
     return camera.T_world_camera.to(dtype=torch.float64).as_matrix().numpy() @ _OPENGL_FROM_OPENCV
-
-
-def farthest_points(points: Float[np.ndarray, "V 3"], count: int, first: int) -> list[int]:
-    """Indices of `count` points, each the farthest from all that were chosen before it, in that order."""
-    chosen = [first]
-    distance = np.linalg.norm(points - points[first], axis=1)
-    while len(chosen) < count:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return chosen
 
 
 def _frames(root: Path, layout: Layout, split: Split, state: int) -> list[Frame]:

@@ -74,7 +74,7 @@ class RobustnessStudy:
             rows.append(Setting(f"threshold_{name}", f"threshold of the motion cue x {factor:.2g}", factor))
         files = {name: self.folder / "points" / f"{name}.npz" for name in _SAYS}
         if not all(file.exists() for file in files.values()):
-            looks = survey(self.capture, "hull", self.config.start, self.seed)
+            looks = survey(self.capture, None, self.config.start, self.seed)
             for name, points in perturbed_points(looks, self.config.start.search.cue, self.seed).items():
                 replace_file(files[name], _as_npz(points))
         rows += [Setting(name, says, points=str(files[name].resolve())) for name, says in _SAYS.items()]

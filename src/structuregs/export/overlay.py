@@ -10,7 +10,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from ..capture import Capture, View, farthest_points, stack_views
+from ..capture import Capture, View, spread_cameras, stack_views
 from ..fit.structure import structure_images, union
 from ..geometry import Box, Camera
 from ..model import ArticulatedObject, Joint
@@ -97,12 +97,10 @@ def _tinted(amount: Float[Tensor, "H W"], colour: Colour) -> Float[Tensor, "H W 
 
 def _choose(obj: ArticulatedObject, views: tuple[View, ...], count: int) -> list[View]:
     """The most telling view, and others far from it among the more telling half of a spread of candidates."""
-    centres = np.stack([view.camera.centre.numpy() for view in views])
-    spread = [views[i] for i in farthest_points(centres, min(_CANDIDATES, len(views)), 0)]
+    spread = [views[i] for i in spread_cameras([view.camera for view in views], _CANDIDATES)]
     best = [spread[i] for i in telling_order(obj, [view.camera for view in spread])]
     best = best[: max(count, len(best) // 2)]
-    centres = np.stack([view.camera.centre.numpy() for view in best])
-    return [best[i] for i in farthest_points(centres, min(count, len(best)), 0)]
+    return [best[i] for i in spread_cameras([view.camera for view in best], count)]
 
 
 def _draw_view(view: View, obj: ArticulatedObject, boxes: Box, size: int) -> np.ndarray:

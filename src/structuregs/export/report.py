@@ -13,7 +13,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
-from ..capture import Capture, View, farthest_points, stack_views
+from ..capture import Capture, View, spread_cameras, stack_views
 from ..fit.reconstruct import RunFolder
 from ..geometry import Camera
 from ..metrics import psnr
@@ -169,8 +169,7 @@ def _comparison(capture: Capture, obj: ArticulatedObject, opening: Camera, count
 
 def _shown(obj: ArticulatedObject, views: Sequence[View], opening: Camera, count: int) -> list[View]:
     """Of views that are spread over the cameras, those that show most of the motion, from the side of the moving parts."""
-    centres = np.stack([view.camera.centre.numpy() for view in views])
-    spread = [views[i] for i in farthest_points(centres, min(_CANDIDATES, len(views)), 0)]
+    spread = [views[i] for i in spread_cameras([view.camera for view in views], _CANDIDATES)]
     towards = opening.T_world_camera.rotation[:, 2]
     before = [view for view in spread if float(view.camera.T_world_camera.rotation[:, 2] @ towards) > 0]
     chosen = before if len(before) >= count else spread

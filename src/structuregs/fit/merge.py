@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from ..capture import ImageStack
+from ..capture import ImageStack, spread_cameras
 from ..geometry import SE3
 from ..model import PosedParts
 from ..raster import render
@@ -41,7 +41,7 @@ def idle_part(parts: PosedParts, photos: ImageStack) -> int | None:
         parts: as fitted so far.
         photos: of state 1.
     """
-    asked = np.unique(np.linspace(0, len(photos) - 1, _VIEWS).round().astype(int))
+    asked = spread_cameras(photos.cameras, _VIEWS)
     moving = _errors(parts, photos, asked)
     needs = {}
     for k in range(1, len(parts)):
@@ -54,7 +54,7 @@ def idle_part(parts: PosedParts, photos: ImageStack) -> int | None:
     return min(needs, key=needs.__getitem__) if needs else None
 
 
-def _errors(parts: PosedParts, photos: ImageStack, asked: np.ndarray) -> Float64[np.ndarray, " V"]:
+def _errors(parts: PosedParts, photos: ImageStack, asked: list[int]) -> Float64[np.ndarray, " V"]:
     """Mean absolute colour difference of each photo asked."""
     splats = parts.at_state(1)
     pictures = [(render(splats, photos.cameras[v]).rgb, photos.target(int(v))[0]) for v in asked]

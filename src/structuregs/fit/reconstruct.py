@@ -17,6 +17,7 @@ from ..capture import Capture
 from ..geometry import SE3, Box
 from ..joints import articulate, joints_of
 from ..model import ArticulatedObject, PosedParts, load_object, save_object
+from ..points import points_from
 from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
 from .loop import FitState, Fitter
 from .schedule import PRESETS, FitConfig
@@ -122,9 +123,12 @@ def start_parts(
     capture: Capture, config: FitConfig, *, parts: int | None, points: str, seed: int
 ) -> Generator[FitEvent, None, PosedParts]:
     """Boxes, motions and the splats strewn in them, its progress as events."""
+    given = points_from(capture, points)
+    for sentence in given.says if given else ():
+        yield Note(sentence)
     yield StageStarted("look", 2)
     looks = []
-    for look in look_at_states(capture, points, config.start, seed):
+    for look in look_at_states(capture, given, config.start, seed):
         looks.append(look)
         yield Step("look", len(looks), None, None, sum(len(look.splats) for look in looks))
     pair = (looks[0], looks[1])
@@ -226,7 +230,7 @@ def fit_run(
         config: the whole configuration.
         device: "auto", "cpu" or "cuda".
         parts: number of moving parts, of which then none is merged with another; estimated if None.
-        points: where first points come from: "hull", "depth" or a file.
+        points: where first points come from: "hull", "depth", "vggt", "pi3" or a file (see `points.points_from`).
         seed: of all randomness; the same seed gives the same bytes on a CPU.
 
     Raises:
@@ -305,7 +309,7 @@ def reconstruct(
         config: default: the preset "default".
         device: "auto", "cpu" or "cuda".
         parts: number of moving parts; estimated if None.
-        points: where first points come from: "hull", "depth" or a file.
+        points: where first points come from: "hull", "depth", "vggt", "pi3" or a file (see `points.points_from`).
         seed: of all randomness.
     """
     config = config or PRESETS["default"]

@@ -1,6 +1,16 @@
 """What is known of a capture's surface before any fit: visual hulls and point clouds."""
 
+from .alignment import Alignment, Similarity, align_cameras
 from .clouds import Clouds, points_from
 from .hull import Hull, Silhouettes, object_bounds
 
-__all__ = ["Clouds", "Hull", "Silhouettes", "object_bounds", "points_from"]
+__all__ = [
+    "Alignment",
+    "Clouds",
+    "Hull",
+    "Silhouettes",
+    "Similarity",
+    "align_cameras",
+    "object_bounds",
+    "points_from",
+]

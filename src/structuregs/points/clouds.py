@@ -1,5 +1,6 @@
-"""Point clouds that come from elsewhere than the masks: depth maps and files."""
+"""Point clouds that come from elsewhere than the masks: depth maps, pretrained estimators and files."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -9,29 +10,46 @@ import trimesh
 from jaxtyping import Float64
 
 from ..capture import Capture, CaptureError, View
+from .estimators import ESTIMATORS, estimated_points
 
-Clouds = tuple[Float64[np.ndarray, "P 3"], Float64[np.ndarray, "Q 3"]]
 _MOST_POINTS = 40_000  # of a cloud; more only cost time in a cue that is coarse by intent
+
+
+@dataclass(frozen=True)
+class Clouds:
+    """Points of an object's surface.
+
+    Attributes:
+        points: of state 0 and of state 1, in the world.
+        says: what a user should know of where they come from.
+    """
+
+    points: tuple[Float64[np.ndarray, "P 3"], Float64[np.ndarray, "Q 3"]]
+    says: tuple[str, ...] = ()
 
 
 def points_from(capture: Capture, source: str) -> Clouds | None:
     """The points of both states in the world from `source`; None for "hull", which needs no cloud.
 
     Args:
-        capture: whose depth maps are read.
-        source: "hull", "depth", an .npz with arrays `points_0` and `points_1`, or a .ply path with `{state}` in it, which
-            stands for 0 and 1.
+        capture: whose depth maps or photos are read.
+        source: "hull", "depth", "vggt", "pi3", an .npz with arrays `points_0` and `points_1`, or a .ply path with `{state}`
+            in it, which stands for 0 and 1.
 
     Raises:
-        CaptureError: the depth or the file is not there or does not hold points.
+        CaptureError: the depth, the estimator or the file is not there or does not give points.
     """
     if source == "hull":
         return None
-    if source == "depth":
+    says: list[str] = []
+    if source in ESTIMATORS:
+        (first, second), says = estimated_points(capture, ESTIMATORS[source])
+        first, second = _checked(first, source), _checked(second, source)
+    elif source == "depth":
         first, second = (np.concatenate([_back_projected(view) for view in views]) for views in capture.train)
     else:
         first, second = _read(source)
-    return _thinned(first), _thinned(second)
+    return Clouds((_thinned(first), _thinned(second)), tuple(says))
 
 
 def _back_projected(view: View) -> Float64[np.ndarray, "P 3"]:
@@ -43,11 +61,14 @@ def _back_projected(view: View) -> Float64[np.ndarray, "P 3"]:
     return (origin + rays * torch.from_numpy(depth)[..., None])[torch.from_numpy(seen)].double().numpy()
 
 
-def _read(source: str) -> Clouds:
+def _read(source: str) -> tuple[Float64[np.ndarray, "P 3"], Float64[np.ndarray, "Q 3"]]:
     if source.endswith(".ply") and "{state}" in source:
         return _read_ply(source.replace("{state}", "0")), _read_ply(source.replace("{state}", "1"))
     if not source.endswith(".npz"):
-        raise CaptureError(f"--points {source}: give hull, depth, a file FILE.npz, or a path with {{state}} that ends in .ply.")
+        raise CaptureError(
+            f"--points {source}: give hull, depth, {', '.join(ESTIMATORS)}, a file FILE.npz, or a path with {{state}} that ends"
+            " in .ply."
+        )
     try:
         with np.load(source) as arrays:
             first, second = arrays["points_0"], arrays["points_1"]
