@@ -9,7 +9,7 @@ import pytest
 from structuregs import cli
 from structuregs.capture import CaptureError, find_captures
 from structuregs.evaluate import Bench, BenchRow, bench, write_tables
-from structuregs.evaluate.tables import METRICS, compared, joint_by_joint, published, scene_of
+from structuregs.evaluate.tables import METRICS, compared, joint_by_joint, published, scene_of, trust
 
 FRIDGE, OTHER = Path("data/fridge/10905"), Path("data/desk/7")
 
@@ -26,7 +26,7 @@ def joint(kind: str = "revolute", *, failed: bool = False, angle: float = 0.5) -
 
 
 def report(*joints: dict, **others: object) -> dict:
-    base = {"joints": list(joints), "unmatched_parts": [], "psnr": 30.0, "seconds": 60.0, "peak_gb": 1.5}
+    base = {"joints": list(joints), "unmatched_parts": [], "flagged_parts": [], "psnr": 30.0, "seconds": 60.0, "peak_gb": 1.5}
     surfaces = {"cd_static": 1.0, "cd_movable": 2.0, "cd_whole": 3.0}
     return base | surfaces | {"failures": sum(j["failed"] for j in joints)} | others
 
@@ -102,6 +102,23 @@ class TestTables:
         assert second[:3] == ("", "prismatic (F in 1 of 2)", "0.500")
         (_, lost) = joint_by_joint([BenchRow(OTHER, None, 0, None, "no memory")])
         assert lost[:2] == ("7", "no fit ended: no memory")
+
+    def test_trust_counts_what_is_wrong_and_not_flagged(self):
+        def numbered(part: int | None, **others) -> dict:
+            return joint(**others) | {"part": part, "geodesic_deg": None, "axis_position": 0.01}
+
+        joints = (numbered(1), numbered(2, angle=3.0), numbered(3, angle=3.0), numbered(None, failed=True))
+        rows = [
+            BenchRow(OTHER, None, 0, report(*joints, unmatched_parts=[4, 5], flagged_parts=[2, 5])),
+            BenchRow(OTHER, None, 1, report(numbered(1, failed=True), flagged_parts=[])),
+            BenchRow(OTHER, None, 2, None, "no memory"),
+        ]
+        assert trust(rows)[1:] == [
+            ("right", "0", "1"),
+            ("wrong", "1", "2"),
+            ("too many", "1", "1"),
+            ("not found", "", "1"),
+        ]
 
     def test_the_files_hold_every_row(self, tmp_path):
         rows = [BenchRow(FRIDGE, v, 0, report(joint())) for v in (None, 10)]

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..geometry import SE3, Box, screw_at
 from ..joints import kind_of
 from ..model import SH_C0, Splats
-from ..raster import Render, image_loss, render
+from ..raster import Render, image_loss, painted_share, render
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
@@ -60,13 +60,8 @@ class Scene:
     def footprint(self, part: Splats) -> float:
         """Mean share of the judging photos that shows the part where it is."""
         both = Splats.concatenate([self.rest, part])
-        white = torch.arange(len(both)) >= len(self.rest)
-        sh = torch.zeros(len(both), 1, 3)
-        sh[:, 0] = torch.where(white, 0.5, -0.5)[:, None] / SH_C0
-        marked, black = replace(both, sh=sh), torch.zeros(3)
-        return float(
-            np.mean([float(render(marked, self.look.stack.cameras[v], background=black).rgb.mean()) for v in self.views])
-        )
+        chosen = torch.arange(len(both)) >= len(self.rest)
+        return float(np.mean([painted_share(both, chosen, self.look.stack.cameras[v]) for v in self.views]))
 
     def support(self, part: Splats, motions: SE3) -> Float64[np.ndarray, "M N"]:
         """What each splat of a part takes off the photos' error under each of M motions of the part.

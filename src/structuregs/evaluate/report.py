@@ -55,6 +55,7 @@ class Report:
         protocol: their protocol's name.
         joints: one entry for each true joint; empty where the capture has no ground truth.
         unmatched_parts: reconstructed parts that no true joint stands for.
+        flagged_parts: reconstructed parts whose joints ask for a human's look.
         psnr: mean over the images of the test views of both states, dB; None without test views.
         psnr_by_state: the same for each state.
         psnr_object: over the object's own pixels; None unless the protocol asks for it.
@@ -65,6 +66,7 @@ class Report:
     protocol: str
     joints: tuple[JointScore, ...]
     unmatched_parts: tuple[int, ...]
+    flagged_parts: tuple[int, ...]
     psnr: float | None
     psnr_by_state: tuple[float | None, float | None]
     psnr_object: float | None
@@ -136,6 +138,7 @@ def evaluate_object(
         protocol,
         joints,
         tuple(k for k in range(1, len(obj.parts)) if truth and k not in found),
+        tuple(k for k, joint in enumerate(obj.joints, start=1) if joint.review),
         _mean(rows, counts),
         (rows[0], rows[1]),
         _mean(by_object, counts),

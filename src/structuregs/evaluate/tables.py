@@ -134,6 +134,32 @@ def joint_by_joint(rows: Sequence[BenchRow]) -> list[tuple[str, ...]]:
     return table
 
 
+_WRONG = {"axis_angle_deg": 2.0, "axis_position": 0.02, "geodesic_deg": 2.0, "translation": 0.02}  # beyond these
+
+
+def trust(rows: Sequence[BenchRow]) -> list[tuple[str, ...]]:
+    """How many joints came out right, wrong and too many, and how many of each ask for a human's look.
+
+    Wrong: of another type, or off by more than 2 degrees or .02 units in any figure.  What was not found cannot be flagged
+    itself; a fit says how much of what it sees is in no part.
+    """
+    counts = {(what, flagged): 0 for what in ("right", "wrong", "too many") for flagged in (True, False)}
+    missing = 0
+    for report in (row.report for row in rows if row.report is not None):
+        flagged = set(report["flagged_parts"])
+        for joint in report["joints"]:
+            if joint["part"] is None:
+                missing += 1
+                continue
+            off = any(joint[name] is not None and joint[name] > bound for name, bound in _WRONG.items())
+            counts["wrong" if joint["failed"] or off else "right", joint["part"] in flagged] += 1
+        for part in report["unmatched_parts"]:
+            counts["too many", part in flagged] += 1
+    table: list[tuple[str, ...]] = [("joint", "flagged", "not flagged")]
+    table += [(what, str(counts[what, True]), str(counts[what, False])) for what in ("right", "wrong", "too many")]
+    return [*table, ("not found", "", str(missing))]
+
+
 _SURFACES = ("cd_static", "cd_movable", "cd_whole")
 
 
@@ -168,6 +194,8 @@ def write_tables(plan: Bench, rows: Sequence[BenchRow]) -> list[Path]:
         text.append(markdown(compared(here, views)))
         text.append(f"Joint by joint, the worst of seeds {seeds}; {plan.at_once} at a time.\n")
         text.append(markdown(joint_by_joint(here)))
+        text.append("Whether what is wrong is flagged (off by more than 2 degrees or .02 units, or of another type).\n")
+        text.append(markdown(trust(here)))
         setting = {None: "full", 10: "sparse"}.get(views, str(views))
         for scene in dict.fromkeys(scene_of(row.capture) for row in here):
             of_scene = [row for row in here if scene_of(row.capture) == scene]

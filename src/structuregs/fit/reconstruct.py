@@ -19,6 +19,7 @@ from ..joints import articulate, joints_of
 from ..model import ArticulatedObject, PosedParts, load_object, save_object
 from ..points import points_from
 from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
+from .evidence import seen_in_both
 from .loop import FitState, Fitter
 from .schedule import PRESETS, FitConfig
 
@@ -269,7 +270,7 @@ def fit_run(
                 yield Preview(partial(unfinished_object, fitter.state))
         fitter.state.save(folder.checkpoint)
         clock.save()
-    obj = finished_object(fitter.state)
+    obj = seen_in_both(finished_object(fitter.state), capture)
     save_object(obj, folder.object)
     clock.save()
     yield Finished(obj, run)

@@ -4,7 +4,7 @@ from .image_loss import image_loss
 from .median import Surface, render_surface
 from .planes import PlaneImage, render_planes
 from .records import Projection, Render
-from .render import blend, project, render
+from .render import blend, painted_share, project, render
 
 __all__ = [
     "PlaneImage",
@@ -13,6 +13,7 @@ __all__ = [
     "Surface",
     "blend",
     "image_loss",
+    "painted_share",
     "project",
     "render",
     "render_planes",

@@ -1,14 +1,15 @@
 """The renderer's door: picks the back end."""
 
 import importlib
+from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..geometry import Camera
-from ..model import Splats
+from ..model import SH_C0, Splats
 from .records import Projection, Render
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
@@ -38,6 +39,15 @@ def render(
     if backend == "auto":
         backend = "cuda" if splats.means.is_cuda else "cpu"
     return _module(backend).render(splats, camera, background=background)
+
+
+@torch.no_grad()
+def painted_share(splats: Splats, chosen: Bool[Tensor, " N"], camera: Camera) -> float:
+    """The share of the image that some of the splats paint, where the others may stand before them."""
+    sh = torch.zeros(len(splats), 1, 3, device=splats.means.device)
+    sh[:, 0] = torch.where(chosen, 0.5, -0.5)[:, None] / SH_C0
+    black = splats.means.new_zeros(3)
+    return float(render(replace(splats, sh=sh), camera, background=black).rgb.mean())
 
 
 def stages(tensor: Tensor):

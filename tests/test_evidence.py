@@ -1,0 +1,83 @@
+"""A closed box of splats, and a ball that slides out of it: which photos show the ball, and what follows."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from structuregs.capture import Capture
+from structuregs.fit.evidence import seen_in_both
+from structuregs.geometry import SE3, Box
+from structuregs.joints import articulate
+from structuregs.model import ArticulatedObject, PosedParts, Splats
+from structuregs.raster import painted_share, render
+from structuregs.synthetic import RenderOptions, make_capture, make_object
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return make_capture(make_object("laptop"), RenderOptions(size=64, views=6, test_views=1, samples=1))
+
+
+def blobs(means: torch.Tensor, size: float) -> Splats:
+    n = len(means)
+    log_scales = torch.full((n, 3), size).log()
+    return Splats(means, torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), log_scales, torch.full((n,), 6.0), torch.zeros(n, 1, 3))
+
+
+def walls() -> torch.Tensor:
+    """Points on the faces of [-1, 1]^3."""
+    faces = []
+    side = torch.linspace(-1, 1, 13)
+    u, v = (t.flatten() for t in torch.meshgrid(side, side, indexing="ij"))
+    for axis in range(3):
+        for level in (-1.0, 1.0):
+            face = torch.stack([u, v, torch.full_like(u, level)], 1)
+            faces.append(face.roll(axis, 1))
+    return torch.cat(faces)
+
+
+def hidden_ball(out: float) -> ArticulatedObject:
+    """A ball in the middle of a closed box in state 0, `out` further along x in state 1."""
+    boxes = Box(SE3.identity(2), torch.tensor([[0.3, 0.3, 0.3], [0.1, 0.1, 0.1]]))
+    slide = SE3.exp(torch.tensor([out, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    motions = SE3(torch.stack([SE3.identity().wxyz_xyz, slide.wxyz_xyz]))
+    generator = torch.Generator().manual_seed(0)
+    ball = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=-1)
+    shell, inner = blobs(walls(), 0.03), blobs(ball, 0.02)
+    counts = (len(shell), len(inner))
+    return articulate(PosedParts(boxes, motions, Splats.concatenate([shell, inner]), counts, torch.zeros(sum(counts), 3)))
+
+
+def test_what_one_state_hides_is_flagged(capture: Capture):
+    before = hidden_ball(out=0.7)
+    assert before.joints[0].confidence == 1
+    (joint,) = seen_in_both(before, capture).joints
+    assert joint.confidence < 0.2
+    assert joint.review == "Hardly a photo of state 0 shows the part: where it is there is a guess."
+
+
+def test_what_both_states_show_keeps_its_confidence(capture: Capture):
+    obj = hidden_ball(out=0.7)
+    away = SE3.exp(torch.tensor([0.0, 0.7, 0.0, 0.0, 0.0, 0.0]))
+    moved = Box(SE3(torch.stack([SE3.identity().wxyz_xyz, away.wxyz_xyz])), obj.parts.boxes.half_extents)
+    seen = articulate(replace(obj.parts, boxes=moved))
+    (joint,) = seen_in_both(seen, capture).joints
+    assert joint.confidence == 1
+    assert joint.review == ""
+
+
+def test_an_older_doubt_is_kept(capture: Capture):
+    obj = hidden_ball(out=0.7)
+    doubtful = replace(obj, joints=(replace(obj.joints[0], confidence=0.5, review="Older."),))
+    (joint,) = seen_in_both(doubtful, capture).joints
+    assert joint.confidence < 0.1
+    assert joint.review == "Older."
+
+
+def test_painted_shares_add_up_to_the_picture_s_coverage(capture: Capture):
+    splats = hidden_ball(out=0.7).parts.at_state(1)
+    camera = capture.train[0][0].camera
+    some = torch.arange(len(splats)) % 3 == 0
+    total = painted_share(splats, some, camera) + painted_share(splats, ~some, camera)
+    assert total == pytest.approx(float(render(splats, camera).alpha.mean()), abs=1e-5)
