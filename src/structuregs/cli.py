@@ -216,7 +216,7 @@ def _number(word: str, option: str) -> int:
 
 
 def study(
-    kind: Annotated[tyro.conf.Positional[Literal["robustness"]], tyro.conf.arg(metavar="STUDY")],
+    kind: Annotated[tyro.conf.Positional[Literal["robustness", "ablation", "variations"]], tyro.conf.arg(metavar="STUDY")],
     capture: CaptureFolder,
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")],
     preset: Preset = "default",
@@ -227,21 +227,22 @@ def study(
     """Fit a capture under other conditions, and write how the results differ; run it again to go on.
 
     Args:
-        kind: robustness: from bad starts, as section 2 of the paper's supplement.
+        kind: robustness: from bad starts, as section 2 of the paper's supplement. ablation: one choice of the fit undone at
+            a time. variations: worse and other photos.
         capture: Folder of the capture.
-        output: Folder of the runs and of robustness.md, robustness.html and error_maps.png.
+        output: Folder of the runs and of STUDY.md, STUDY.html and error_maps.png.
         preset: As `fit` takes it.
         views: Use this many views of each state; None: all.
         seed: As `fit` takes it.
         device: Where to compute.
     """
     from .capture import find_truth, load_capture, load_truth
-    from .evaluate import RobustnessStudy
+    from .evaluate import Study
     from .fit.schedule import PRESETS
 
     photos = load_capture(capture, views=views, seed=seed)
     truth = find_truth(photos)
-    plan = RobustnessStudy(photos, output, PRESETS[preset], device, seed)
+    plan = Study(kind, photos, output, PRESETS[preset], device, seed)
     settings = plan.settings()
     for setting in settings:
         print(f"{kind}: {setting.says}", flush=True)

@@ -12,21 +12,23 @@ from .report import (
     training_capture,
     write_report,
 )
-from .robustness import RobustnessStudy, Setting
 from .scores import JointScore, score_joints
+from .setting import Setting
+from .study import STUDIES, Study
 from .surfaces import SURFACE_PROTOCOLS, SurfaceProtocol, SurfaceScore, score_surfaces
 from .tables import write_tables
 
 __all__ = [
     "PROTOCOLS",
+    "STUDIES",
     "SURFACE_PROTOCOLS",
     "Bench",
     "BenchRow",
     "JointScore",
     "Protocol",
     "Report",
-    "RobustnessStudy",
     "Setting",
+    "Study",
     "SurfaceProtocol",
     "SurfaceScore",
     "bench",
