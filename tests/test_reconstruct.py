@@ -112,15 +112,15 @@ class TestObjects:
         assert gap_of_axes(joint, true) < 0.1
         assert math.degrees(joint.q[1]) == pytest.approx(math.degrees(true.q1 - true.q0), abs=6)
 
-    def test_what_does_not_move_has_no_joints(self, tmp_path: Path):
-        events = list(
-            fit_run(photographed("static"), tmp_path / "run", replace(TINY, steps=60, checkpoint_every=60), device="cpu")
-        )
+    def test_what_does_not_move_has_no_joints_and_what_was_asked_for_is_noted(self, tmp_path: Path):
+        short = replace(TINY, steps=60, checkpoint_every=60)
+        events = list(fit_run(photographed("static"), tmp_path / "run", short, device="cpu", parts=1))
         obj = finished(events)
         assert obj.joints == ()
         assert len(obj.parts) == 1
         assert Note("0 moving parts found") in events
         assert len(load_object(tmp_path / "run" / "object").parts) == 1
+        assert (tmp_path / "run" / "notes.txt").read_text().startswith("1 were asked for: ")
 
 
 class TestEvents:

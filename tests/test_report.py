@@ -34,7 +34,8 @@ def run(obj, tmp_path_factory) -> Path:
     (run / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in RECORDS))
     (run / "timing.json").write_text('{"total": 3725.4}')
     (run / "config.json").write_text(json.dumps({"seed": 3, "fit": {"start": {"voxels": 96}, "sizes": [[0.0, 160]]}}))
-    write_report(run, photographed(obj), obj, notes=["2 moving parts found"])
+    (run / "notes.txt").write_text("5% of what state 1 shows is in no part\n")
+    write_report(run, photographed(obj), obj)
     return run
 
 
@@ -62,7 +63,7 @@ def test_it_says_of_every_joint_what_it_is_and_how_sure(text):
 def test_warnings_are_the_joints_doubts_and_the_fits_notes(text, obj, tmp_path):
     Image.new("RGB", (7, 5)).save(tmp_path / "overview.png")
     items = re.findall(r"<li>(.*?)</li>", text)
-    assert items == ["Part 1: a slide fits &lt;almost&gt; as well", "2 moving parts found"]
+    assert items == ["Part 1: a slide fits &lt;almost&gt; as well", "5% of what state 1 shows is in no part"]
     clear = replace(obj, joints=tuple(replace(joint, review="", confidence=0.9) for joint in obj.joints))
     capture = photographed(obj)
     assert "<li>" not in write_report(tmp_path, capture, clear).read_text()
@@ -103,9 +104,9 @@ def test_figures_and_settings_are_those_of_the_runs_files(text):
 
 
 def test_the_report_is_one_file_and_the_same_each_time(run, text, obj):
-    again = write_report(run, photographed(obj), obj, notes=["2 moving parts found"])
+    again = write_report(run, photographed(obj), obj)
     assert again.read_text() == text
-    assert {file.name for file in run.iterdir()} == {"metrics.jsonl", "timing.json", "config.json", "report.html"}
+    assert {file.name for file in run.iterdir()} == {"metrics.jsonl", "timing.json", "notes.txt", "config.json", "report.html"}
     assert not re.search(r"https?://|src=\"(?!data:)|<script", text)
 
 

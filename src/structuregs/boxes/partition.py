@@ -208,7 +208,7 @@ class PartSearch:
             if index in explained:
                 continue
             part, members = self._try(index, parts, explained)
-            if pieces := self._divided(part, members, parts):
+            if part.gain > NOISE and (pieces := self._divided(part, members, parts)):
                 explained |= members
                 todo = pieces + todo
                 continue

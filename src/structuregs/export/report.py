@@ -33,21 +33,21 @@ _BORDER = 8  # pixels of white around the animation
 _UNCLEAR = 0.5  # a joint of less confidence is a warning
 
 
-def write_report(run: Path, capture: Capture, obj: ArticulatedObject, *, notes: Sequence[str] = (), views: int = 3) -> Path:
+def write_report(run: Path, capture: Capture, obj: ArticulatedObject, *, views: int = 3) -> Path:
     """Writes `RUN/report.html` aside, then into place; returns its path.  The page needs no other file.
 
     Held-out photos are shown where the capture has them, photos that the fit has seen elsewhere.
 
     Args:
-        run: folder of the run; what it lacks of `metrics.jsonl`, `timing.json` and `config.json` is left out.
+        run: folder of the run; what it lacks of `metrics.jsonl`, `timing.json`, `notes.txt` and `config.json` is left out.
         capture: the photos.
         obj: what was found in them.
-        notes: sentences that the fit said, for the warnings.
         views: photos of each state beside their renderings.
     """
     folder = RunFolder(run)
     metrics = folder.records()
     seconds = folder.seconds()
+    notes = folder.notes.read_text().splitlines() if folder.notes.exists() else []
     opening = opening_camera(obj, _SWEEP_SIZE)
     sections = [
         _warnings(obj, capture, notes),

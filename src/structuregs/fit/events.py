@@ -41,9 +41,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Note:
-    """Something a user should know, in one sentence."""
+    """Something a user should know, in one sentence.
+
+    Attributes:
+        text: the sentence.
+        lasting: whether it says something of the result, which whoever reads the report should know too.
+    """
 
     text: str
+    lasting: bool = False
 
 
 @dataclass(frozen=True)

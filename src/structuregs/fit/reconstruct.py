@@ -53,6 +53,11 @@ class RunFolder:
         return self.root / "timing.json"
 
     @property
+    def notes(self) -> Path:
+        """What the fit said of its result, a sentence a line; not there where it said nothing."""
+        return self.root / "notes.txt"
+
+    @property
     def object(self) -> Path:
         """The folder of the articulated object."""
         return self.root / "object"
@@ -126,7 +131,7 @@ def start_parts(
     """Boxes, motions and the splats strewn in them, its progress as events."""
     given = points_from(capture, points)
     for sentence in given.says if given else ():
-        yield Note(sentence)
+        yield Note(sentence, lasting=True)
     yield StageStarted("look", 2)
     looks = []
     for look in look_at_states(capture, given, config.start, seed):
@@ -140,7 +145,8 @@ def start_parts(
         found = (yield from _searched(search))[:parts]
         for state, share in search.left_over:
             yield Note(
-                f"{share:.0%} of what state {state} shows is in no part: no one motion puts it where state {1 - state} has it"
+                f"{share:.0%} of what state {state} shows is in no part: no one motion puts it where state {1 - state} has it",
+                lasting=True,
             )
         boxes, motions = boxes_of_parts(pair, found, config.start)
         posed = seeded(boxes, motions, pair, found, *filling)
@@ -150,7 +156,7 @@ def start_parts(
     count = len(posed) - 1
     yield Note(f"{count} moving part{'' if count == 1 else 's'} found")
     if parts is not None and count != parts:
-        yield Note(f"{parts} were asked for: what else moves does not show in masks and photos")
+        yield Note(f"{parts} were asked for: what else moves does not show in masks and photos", lasting=True)
     return posed
 
 
@@ -253,7 +259,7 @@ def fit_run(
         folder.cut_metrics(state.step)
         yield Note(f"going on from step {state.step}")
     else:
-        begun = yield from start_parts(capture, config, parts=parts, points=points, seed=seed)
+        begun = yield from _noted(start_parts(capture, config, parts=parts, points=points, seed=seed), folder)
         state = FitState.start(begun.to(chosen))
         state.save(folder.checkpoint)
         clock.save()
@@ -274,6 +280,21 @@ def fit_run(
     save_object(obj, folder.object)
     clock.save()
     yield Finished(obj, run)
+
+
+def _noted(events: Generator[FitEvent, None, PosedParts], folder: RunFolder) -> Generator[FitEvent, None, PosedParts]:
+    """The events; what lasts of their notes is written into the run when they end."""
+    notes: list[str] = []
+    while True:
+        try:
+            event = next(events)
+        except StopIteration as done:
+            if notes:
+                _write(folder.notes, "".join(f"{note}\n" for note in notes))
+            return done.value
+        if isinstance(event, Note) and event.lasting:
+            notes.append(event.text)
+        yield event
 
 
 def _append(file: Path, step: Step) -> None:
