@@ -242,9 +242,9 @@ class PartSearch:
             as_they_move = np.array([scene.error(piece, T) for T in shared])
             losses = as_they_move - min(h.image_error for h in again)
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
-            # A piece that touches a weightier part, and has no better motion of its own than that part's, belongs to it.
+            # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
             needless = as_they_move < min(h.cost(part.weight) for h in again[: -len(shared)])
-            alike |= needless & np.array([other.weight > part.weight and self._touch(part, other) for other in others])
+            alike |= needless & np.array([other.weight > part.weight and self._continues(part, other) for other in others])
 
             twin = int(np.argmin(np.where(alike, as_they_move, np.inf)))
             if alike[twin]:
@@ -258,10 +258,13 @@ class PartSearch:
             index += 1
         return parts
 
-    def _touch(self, part: MovingPart, other: MovingPart) -> bool:
-        """Whether two parts lie within the reach of the clustering where the one was found."""
-        nearest = KDTree(other.points_in(part.state)).query(part.points)[0].min()
-        return bool(nearest < self.config.cue.link * self.voxel)
+    def _continues(self, part: MovingPart, other: MovingPart) -> bool:
+        """Whether two parts touch where the one was found (the clustering's reach), and one box holds both about as well."""
+        theirs = other.points_in(part.state)
+        if KDTree(theirs).query(part.points)[0].min() > self.config.cue.link * self.voxel:
+            return False
+        whole, *both = (float(self._box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
+        return sum(both) > self.config.cue.hollow * whole
 
     def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those that lie within a larger one: what was left over before that one was whole."""
