@@ -1,4 +1,4 @@
-"""The command line: `structuregs fit | eval | render | export | view | bench | demo`."""
+"""The command line: `structuregs fit | eval | render | export | view | bench | study | demo`."""
 
 import math
 import os
