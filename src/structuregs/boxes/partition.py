@@ -182,7 +182,7 @@ class PartSearch:
         return held
 
     def _scene(self, state: int, rest: Splats) -> Scene:
-        """A state's photos, evenly spread, as judges of a part among all the rest."""
+        """A state's photos, some that are well apart, as judges of a part among all the rest."""
         views = spread_cameras(self.looks[state].stack.cameras, self.config.looks)
         return Scene(self.looks[state], rest, np.array(views), self.still)
 
@@ -388,6 +388,8 @@ class PartSearch:
 
     def _shown(self, best: Hypothesis, index: int, group: frozenset[int], scene: Scene) -> set[int]:
         """The clusters of a group that the photos miss if they do not move along."""
+        if not group:
+            return set()
         everything = scene.error(self._piece({index, *group}), best.motion)
         without = {i: scene.error(self._piece({index, *group} - {i}), best.motion) for i in group}
         return {i for i, error in without.items() if error - everything > self.config.shown * self.weights[i]}

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 from scipy import ndimage
 
 from ..boxes import clusters, survey
@@ -16,8 +15,6 @@ from ..fit.schedule import FitConfig
 from ..geometry import SE3
 from .ablation import without_tint
 from .setting import Setting
-
-Image = UInt8[np.ndarray, "H W 4"]
 
 _PIXELS = 2  # by which masks are off
 _NOISE = 0.05  # standard deviation of colours in [0, 1]

@@ -26,9 +26,9 @@ def seen_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject:
         capture: what it was fitted to.
     """
     shares = torch.zeros(2, len(obj.parts))
+    owners = torch.repeat_interleave(torch.arange(len(obj.parts)), torch.tensor(obj.parts.counts))
     for state, views in enumerate(capture.train):
         stack, splats = stack_views(views, _SIZE), obj.parts.at_state(state)
-        owners = torch.repeat_interleave(torch.arange(len(obj.parts)), torch.tensor(obj.parts.counts))
         cameras = [stack.cameras[v] for v in spread_cameras(stack.cameras, _PHOTOS)]
         for k in range(1, len(obj.parts)):
             shares[state, k] = sum(painted_share(splats, owners == k, camera) for camera in cameras) / len(cameras)
