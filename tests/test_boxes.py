@@ -23,7 +23,7 @@ from structuregs.boxes import (
     survey,
 )
 from structuregs.boxes.appearance import AppearanceConfig
-from structuregs.boxes.divide import FACTORS, divide
+from structuregs.boxes.divide import FACTORS, cut_fronts, divide
 from structuregs.boxes.hypotheses import (
     Hypothesis,
     candidate_motions,
@@ -36,11 +36,10 @@ from structuregs.boxes.hypotheses import (
     stack_motions,
     turn_about,
 )
-from structuregs.boxes.judge import Scene, refine
+from structuregs.boxes.judge import Scene, Trial, refine
 from structuregs.capture import Capture, TrueJoint
 from structuregs.geometry import SE3, Box, Screw
 from structuregs.joints import kind_of
-from structuregs.model import Splats
 from structuregs.points import points_from
 from structuregs.raster import render
 from structuregs.synthetic import KnownObject, Lighting, RenderOptions, make_capture, make_object
@@ -208,10 +207,10 @@ class TestOddity:
         assert oddity(opened, door, hinge) + 0.9 < min(wrong)
 
     def test_an_odd_motion_must_look_better_to_be_preferred(self):
-        plain = Hypothesis(NO_MOTION, outside=0.0, unexplained=0.0, oddity=0.0, image_error=0.10)
+        plain = Hypothesis(NO_MOTION, outside=0.0, unexplained=0.0, oddity=0.0, image_error=0.10, back_error=0.1)
         odd = replace(plain, oddity=2.0, image_error=0.09)
-        assert plain.cost(0.1) < odd.cost(0.1)
-        assert odd.cost(0.001) < plain.cost(0.001), "where little is to be gained, the photos decide"
+        assert plain.error + plain.against(0.1) < odd.error + odd.against(0.1)
+        assert odd.error + odd.against(0.001) < plain.error + plain.against(0.001), "where little is to be gained"
 
 
 class TestDistinct:
@@ -274,6 +273,22 @@ def parts_of(name: str) -> list[MovingPart]:
     return find_parts(looks_of(name)[1], None, SMALL, seed=0)
 
 
+@lru_cache
+def trial_of_screen() -> Trial:
+    """The laptop's screen between the photos of both states, cut out by its true box."""
+    obj, looks = looks_of("laptop")
+    (true,) = obj.joints
+    box = obj.parts[1].boxes[0].box
+    screen = Box(box.T_world_box, box.half_extents + 0.03)
+    inside = [
+        b.contains(look.splats.means.double()) for b, look in zip((screen, screen.moved(true.motion())), looks, strict=True)
+    ]
+    there, here = (
+        Scene(looks[s], looks[1 - s].splats[~inside[1 - s]], np.arange(0, 16, 2), KDTree(looks[s].points)) for s in (1, 0)
+    )
+    return Trial(there, here, looks[1].splats, looks[0].splats[inside[0]], screen, weight=0.1, most=0.1, near=0.0)
+
+
 def distance_to_surface(points: np.ndarray, obj: KnownObject, state: int) -> Tensor:
     rows = []
     for item in (item for part in obj.parts for item in part.at_state(state)):
@@ -295,7 +310,7 @@ class TestSurvey:
         for look in looks:
             scene = Scene(look, look.splats, np.arange(3), KDTree(look.points))
             nothing = Scene(look, look.splats[:1], np.arange(3), KDTree(look.points))
-            assert scene.absent(look.splats) < 0.2 * nothing.absent(look.splats)
+            assert scene.absent < 0.2 * nothing.absent
 
     def test_given_points_take_the_place_of_its_own(self):
         obj, looks = looks_of("laptop")
@@ -387,13 +402,13 @@ class TestParts:
         found = clusters((haunted, looks[1]), SMALL.search.cue)
         assert len(found) == len(clusters(looks, SMALL.search.cue)) + 1
         kept = PartSearch((haunted, looks[1]), SMALL.search, seed=0)
-        assert [len(c.points) for c in kept.clusters] == [len(c.points) for c in search.clusters]
+        assert [len(c.points) for c in kept.pieces.clusters] == [len(c.points) for c in search.pieces.clusters]
 
     def test_where_everything_seems_to_move_it_still_ends(self):
         looks = looks_of("laptop")[1]
         everywhere = CueConfig(threshold=-1e3, neighbours=16)  # every point is further from the other state than that
         search = PartSearch(looks, replace(SMALL.search, cue=everywhere, shortlist=6, finalists=1, steps=5), seed=0)
-        assert len(search.still.data) == len(looks[0].points)
+        assert len(search.pieces.still.data) == len(looks[0].points)
         assert all(len(part.points) > 0 for part in search.search(None))
 
     @pytest.mark.parametrize("share", [0.0, 1.0])
@@ -423,23 +438,38 @@ class TestParts:
         np.testing.assert_allclose(moved, part.points_in(1), atol=1e-5)
 
     def test_a_motion_five_degrees_off_is_pulled_back(self):
-        obj, looks = looks_of("laptop")
-        (true,) = obj.joints
-        screen = Box(obj.parts[1].boxes[0].box.T_world_box, obj.parts[1].boxes[0].box.half_extents + 0.03)
-        pieces: list[Splats] = []
-        for state, box in enumerate((screen, screen.moved(true.motion()))):
-            inside = box.contains(looks[state].splats.means.double())
-            pieces.append(looks[state].splats[inside if state == 0 else ~inside])
+        (true,) = looks_of("laptop")[0].joints
+        screen = trial_of_screen().box
         off = turn_about(true.motion().apply(screen.T_world_box.xyz), torch.tensor([0.0, 0, 0, 0.05, 0.06, 0.04], dtype=F64))
         start = Hypothesis(off @ true.motion(), 0.0, 0.0, 0.0)
         assert errors(start.motion, screen.corners.numpy(), true)[0] > 4.9
-        scene = Scene(looks[1], pieces[1], np.arange(0, 16, 2), KDTree(looks[1].points))
-        found = refine(start, scene, pieces[0], screen, 60, 0.03)
+        trial = trial_of_screen()
+        start = trial.judge(start)
+        found = refine(start, trial, 60, 0.03)
         degrees, gap = errors(found.motion, screen.corners.numpy(), true)
         assert degrees < 1.5
         assert gap < 0.03
-        assert found.image_error < scene.judge(start, pieces[0]).image_error
-        assert found.oddity == pytest.approx(oddity(found.motion, screen, scene.still), abs=1e-6)
+        assert found.error < start.error
+        assert found.oddity == pytest.approx(oddity(found.motion, screen, trial.there.still), abs=1e-6)
+
+    def test_the_photos_of_both_states_speak_for_the_true_motion(self):
+        (true,) = looks_of("laptop")[0].joints
+        trial = trial_of_screen()
+        right, shut = (trial.judge(Hypothesis(T, 0.0, 0.0, 0.0)) for T in (true.motion(), NO_MOTION))
+        assert right.image_error < 0.6 * trial.there.absent
+        assert right.back_error < 0.6 * trial.here.absent
+        assert right.image_error < shut.image_error
+        assert right.back_error < shut.back_error
+        assert trial.gain(right) == pytest.approx(1 - right.error / (trial.there.absent + trial.here.absent))
+
+    def test_what_explains_more_than_the_part_weighs_counts_no_further(self):
+        trial = replace(trial_of_screen(), weight=0.02, most=0.02)
+        without = trial.there.absent, trial.here.absent
+        fair = Hypothesis(NO_MOTION, 0.0, 0.0, 0.0, without[0] - 0.02, without[1] - 0.015)
+        greedy = replace(fair, image_error=without[0] - 0.09, back_error=without[1] - 0.01)
+        assert trial.cost(fair) == pytest.approx(-0.035)
+        assert trial.cost(greedy) == pytest.approx(-0.03)
+        assert greedy.error < fair.error
 
     def test_what_a_splat_takes_off_the_error_adds_up_to_what_the_part_does(self):
         obj, looks = looks_of("laptop")
@@ -450,10 +480,9 @@ class TestParts:
         here, lifted = SE3.identity(1, dtype=F64), slides_by([[0.0, 0.0, 0.5]])
         support = scene.support(part, SE3(torch.cat([here.wxyz_xyz, lifted.wxyz_xyz])))
         assert support.shape == (2, len(part))
-        pixels = look.stack.alpha[scene.views].size
         for row, motion in zip(support, (here, lifted), strict=True):
-            fall = scene.absent(part) - scene.error(part, motion[0])
-            assert row.sum() / pixels == pytest.approx(fall, rel=0.1)
+            fall = scene.absent - scene.error(part, motion[0])
+            assert row.sum() / scene.pixels == pytest.approx(fall, rel=0.1)
         assert support[0].sum() > 0 > support[1].sum()
         assert (support[0] > 0).mean() > 0.7
 
@@ -506,6 +535,43 @@ class TestDivide:
     def test_what_no_factor_suits_is_left_whole(self):
         points, means, _ = self.boards()
         assert len(divide(points, means, np.full((len(FACTORS), len(means)), -1.0), 1.6, 0.0, CueConfig(), voxel=0.05)) == 1
+
+
+class TestCutFronts:
+    """Three drawers side by side, shut in the other state; the outer ones come out .6 and .8 as far as the middle one."""
+
+    WIDTHS = (-1.0, -0.4, 0.5, 1.0)
+    BOX = Box(
+        SE3.from_quat(torch.tensor([1.0, 0, 0, 0], dtype=F64), torch.zeros(3, dtype=F64)),
+        torch.tensor([2.0, 0.3, 0.1], dtype=F64),
+    )
+
+    def pieces(self, factors: tuple[float, float, float], kind: str = "prismatic") -> list[np.ndarray]:
+        generator = np.random.default_rng(0)
+        points = generator.uniform(-1, 1, (2000, 3)) * self.BOX.half_extents.numpy()
+        fronts = generator.uniform(-1, 1, (600, 3))
+        wanted = np.array(factors)[np.digitize(fronts[:, 0], self.WIDTHS[1:3])]
+        tried = np.array(FACTORS)[:, None]
+        # The farther out up to the right place, the more of the drawer is covered; beyond it the front hides the rest.
+        support = np.where(tried <= wanted, tried, 2 * wanted - tried - 0.3) + 0.1 * generator.standard_normal(
+            (len(tried), 600)
+        )
+        along = Screw(kind, torch.tensor([0.0, 1, 0], dtype=F64), torch.zeros(3, dtype=F64))  # pyright: ignore[reportArgumentType]
+        return cut_fronts(points, self.BOX, fronts, support, along)
+
+    def test_drawers_that_come_out_differently_are_cut_where_they_meet(self):
+        pieces = sorted(self.pieces((0.6, 1.0, 0.8)), key=lambda piece: piece[:, 0].mean())
+        assert [len(piece) for piece in pieces] == pytest.approx([600, 900, 500], abs=60)
+        ends = [(piece[:, 0].min() / 2, piece[:, 0].max() / 2) for piece in pieces]
+        np.testing.assert_allclose(ends, list(zip(self.WIDTHS, self.WIDTHS[1:], strict=False)), atol=0.03)
+
+    def test_one_that_comes_out_as_a_whole_is_left_whole(self):
+        (piece,) = self.pieces((1.0, 1.0, 1.0))
+        assert len(piece) == 2000
+
+    def test_nothing_is_cut_where_the_motion_carries_it(self):
+        (piece,) = self.pieces((0.6, 1.0, 0.8), kind="revolute")
+        assert len(piece) == 2000, "the boards lie beside each other across the axis, not along it"
 
 
 class TestBoxesOfParts:

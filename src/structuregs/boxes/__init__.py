@@ -1,8 +1,10 @@
 """Clouds to boxes matched across states, with hypotheses for their motions."""
 
+from .config import SearchConfig
 from .cue import Cluster, CueConfig, StateLook, box_around, clusters
 from .fill import seeded, strewn
-from .partition import MovingPart, PartSearch, SearchConfig
+from .partition import PartSearch
+from .pieces import MovingPart, Pieces
 from .survey import StartConfig, boxes_at_rest, boxes_of_parts, find_parts, look_at_states, survey
 
 __all__ = [
@@ -10,6 +12,7 @@ __all__ = [
     "CueConfig",
     "MovingPart",
     "PartSearch",
+    "Pieces",
     "SearchConfig",
     "StartConfig",
     "StateLook",

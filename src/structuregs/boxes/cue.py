@@ -14,6 +14,8 @@ from ..geometry import Box
 from ..model import Splats
 from ..points import Hull
 
+Points = Float64[np.ndarray, "_ 3"]
+
 
 @dataclass(frozen=True)
 class CueConfig:
@@ -86,7 +88,7 @@ def clusters(looks: tuple[StateLook, StateLook], config: CueConfig) -> list[Clus
     return sorted(found, key=lambda cluster: -len(cluster.points))
 
 
-def linked(points: Float64[np.ndarray, "P 3"], config: CueConfig, voxel: float) -> list[Float64[np.ndarray, "_ 3"]]:
+def linked(points: Float64[np.ndarray, "P 3"], config: CueConfig, voxel: float) -> list[Points]:
     """The points in pieces that hang together, without those that lie alone and pieces of a few points (DBSCAN)."""
     if len(points) < config.neighbours:
         return []
@@ -95,7 +97,7 @@ def linked(points: Float64[np.ndarray, "P 3"], config: CueConfig, voxel: float) 
     return [piece for piece in pieces if len(piece) >= 2 * config.neighbours]
 
 
-def split_where_hollow(points: Float64[np.ndarray, "P 3"], thinnest: float, ratio: float) -> list[Float64[np.ndarray, "_ 3"]]:
+def split_where_hollow(points: Float64[np.ndarray, "P 3"], thinnest: float, ratio: float) -> list[Points]:
     """The points, cut by planes across their box's axes for as long as that makes the boxes much smaller.
 
     Two parts that touch in the state where both are open are one cluster; but no one box fits them well.  A single part cut

@@ -9,13 +9,15 @@ import torch
 from jaxtyping import Bool, Float64
 from scipy.spatial import KDTree
 
-from .cue import CueConfig, box_around, linked
-
-Points = Float64[np.ndarray, "_ 3"]
+from ..geometry import Box, Screw
+from .cue import CueConfig, Points, box_around, linked
 
 FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
 """How far along its own way a motion is tried, against what suits the cluster best as a whole."""
 
+_TOGETHER = 1.13  # what is cut must explain so many times what it does as one...
+_BETTER = 1.04  # ...every cut so many times what it did before, ...
+_EACH = 0.08  # ...and every piece this share of what all do as one, and of the points
 _POOL = 24  # neighbours over which a splat's support is averaged
 _VOTERS = 12  # splats around a point that say what it belongs to
 
@@ -45,14 +47,14 @@ def divide(
         voxel: of the hull, world units.
     """
     common = float(support.sum(1).max())
-    pooled = support[:, KDTree(means).query(means, k=min(_POOL, len(means)))[1]].mean(2)
-    own = np.maximum(pooled.max(0), 0.0)
+    local = pooled(means, support)
+    own = np.maximum(local.max(0), 0.0)
     if common <= 0 or own.sum() < max(mixed * common, common + least):
         return [points]
-    best = pooled.argmax(0)
+    best = local.argmax(0)
     strength = np.bincount(best, own, minlength=len(support))
     mode = int(np.convolve(strength, np.ones(3), "same").argmax())
-    agrees = _vote(points, means, (np.abs(best - mode) <= 1) & (own > 0), own)
+    agrees = vote(points, means, (np.abs(best - mode) <= 1) & (own > 0), own)
     cores = linked(points[agrees], cue, voxel)
     if not cores:
         return [points]
@@ -63,9 +65,80 @@ def divide(
     return [points[nearest == k] for k in range(len(pieces))]
 
 
-def _vote(
+def pooled(means: Points, support: Float64[np.ndarray, "F N"]) -> Float64[np.ndarray, "F N"]:
+    """The mean support of each splat and its neighbours."""
+    return support[:, KDTree(means).query(means, k=min(_POOL, len(means)))[1]].mean(2)
+
+
+def vote(
     points: Points, means: Points, yes: Bool[np.ndarray, " N"], weight: Float64[np.ndarray, " N"]
 ) -> Bool[np.ndarray, " P"]:
     """Which points have about them more weight of splats that say yes than of others."""
     near = KDTree(means).query(points, k=min(_VOTERS, len(means)))[1]
     return np.where(yes, weight, -weight)[near].sum(1) > 0
+
+
+def cut_fronts(
+    points: Points, box: Box, fronts: Float64[np.ndarray, "N 3"], support: Float64[np.ndarray, "F N"], screw: Screw
+) -> list[Points]:
+    """The points of one cluster, cut where pieces of it would rather be pulled out by lengths of their own.
+
+    Drawers side by side are one cluster if they touch, and shut they show their fronts alone, flush with what stands still.
+
+    Args:
+        points: of the cluster, in the world.
+        box: around them.
+        fronts: what shows in the other state where the cluster was, as it lies in the box's canonical space.
+        support: of each splat there for each of the factors, brought back (see `Scene.support`).
+        screw: along which the cluster moves as a whole.
+    """
+    towards = (box.T_world_box.rotation.T @ screw.axis).abs()
+    unmoved = towards < 0.2 if screw.kind == "prismatic" else towards > 0.98
+    axes = [int(axis) for axis in torch.nonzero(unmoved).flatten()]
+    common = float(support.sum(1).max())
+    local = box.to_canonical(torch.from_numpy(points)).numpy()
+    pieces = _cut(fronts, support, local, axes, (_EACH * common, _EACH * len(local)))
+    if sum(reached for _, reached in pieces) < _TOGETHER * common:
+        return [points]
+    return [points[np.all((local > low) & (local <= high), axis=1)] for (low, high), _ in pieces]
+
+
+def _cut(
+    fronts: Float64[np.ndarray, "N 3"],
+    support: Float64[np.ndarray, "F N"],
+    points: Float64[np.ndarray, "P 3"],
+    axes: list[int],
+    least: tuple[float, float],
+) -> list[tuple[Float64[np.ndarray, "2 3"], float]]:
+    """Lowest and highest corner of the pieces that had each better move by itself, and what each reaches.
+
+    Args:
+        fronts: places of splats.
+        support: of each splat for each factor of a motion.
+        points: of what is cut.
+        axes: across which cuts are allowed.
+        least: what each piece must reach, and how many points it must hold.
+    """
+    whole = float(support.sum(1).max())
+    best, found = _BETTER * whole, None
+    for axis in axes:
+        order = np.argsort(fronts[:, axis], kind="stable")
+        levels = (fronts[order[:-1], axis] + fronts[order[1:], axis]) / 2
+        below = support[:, order].cumsum(1)[:, :-1]
+        sides = below.max(0), (support.sum(1)[:, None] - below).max(0)
+        held = np.searchsorted(np.sort(points[:, axis]), levels, side="right")
+        allowed = (np.minimum(*sides) > least[0]) & (np.minimum(held, len(points) - held) > least[1])
+        both = np.where(allowed, np.add(*sides), -np.inf)
+        if len(both) and both.max() > best:
+            best, found = both.max(), (axis, levels[both.argmax()])
+    if found is None:
+        return [(np.array([[-np.inf] * 3, [np.inf] * 3]), whole)]
+    axis, level = found
+    low, under = fronts[:, axis] <= level, points[:, axis] <= level
+    below = _cut(fronts[low], support[:, low], points[under], axes, least)
+    above = _cut(fronts[~low], support[:, ~low], points[~under], axes, least)
+    for bounds, _ in below:
+        bounds[1, axis] = min(bounds[1, axis], level)
+    for bounds, _ in above:
+        bounds[0, axis] = max(bounds[0, axis], level)
+    return [*below, *above]

@@ -9,7 +9,7 @@ from torch import Tensor
 from ..geometry import SE3, Box, quat_multiply
 from ..model import SH_C0, PosedParts, Splats
 from .cue import StateLook
-from .partition import MovingPart
+from .pieces import MovingPart
 
 FAINT = -2.2  # logit of the opacity of splats that are only on trial, about 0.1
 

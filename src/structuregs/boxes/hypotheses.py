@@ -31,6 +31,7 @@ class Hypothesis:
         unexplained: fraction of the other state's moving points near the motion's reach that it leaves uncovered.
         oddity: how unlike a joint's the motion is (see `oddity`).
         image_error: mean absolute error of the other state's photos with the part moved so; infinite until looked at.
+        back_error: the same of its own state's photos with what lies there in the other state moved back.
     """
 
     motion: SE3
@@ -38,16 +39,21 @@ class Hypothesis:
     unexplained: float
     oddity: float
     image_error: float = float("inf")
+    back_error: float = float("inf")
 
-    def cost(self, weight: float) -> float:
-        """What hypotheses are compared by: the image error, raised for what else speaks against the motion.
+    @property
+    def error(self) -> float:
+        """What the photos of both states say."""
+        return self.image_error + self.back_error
+
+    def against(self, weight: float) -> float:
+        """What else speaks against the motion, in mean error.
 
         Light that stays in the world while a part turns can make a mirrored pose look better than the true one, and what is
         shut shows little of itself; therefore what is odd about a motion, and what the masks say, count as shares of
         `weight`: what the photos of the part's own state would lose without it, in mean error.
         """
-        against = 0.1 * self.oddity + 0.2 * min(self.outside, 1.0) + 0.1 * self.unexplained
-        return self.image_error + weight * against
+        return weight * (0.1 * self.oddity + 0.2 * min(self.outside, 1.0) + 0.1 * self.unexplained)
 
 
 def hinge_screws(box: Box) -> list[Screw]:
@@ -186,6 +192,21 @@ def distinct(motions: SE3, box: Box, gap: float, most: int) -> list[int]:
             kept.append(index)
             near |= displacements(motions, motions[index], box) < gap
     return kept
+
+
+def finalists(motions: SE3, costs: list[float], box: Box, most: int) -> list[int]:
+    """Indices of the best by the photos and, where these see little of a part or in another light, the best by the masks.
+
+    Args:
+        motions: in the masks' order.
+        costs: by which the photos order them.
+        box: of what moves.
+        most: so many of the photos' choice and of the masks', all distinct.
+    """
+    rows = []
+    for order in (np.argsort(costs, kind="stable"), np.arange(len(costs))):
+        rows += order[distinct(motions[order], box, 0.15, most)].tolist()
+    return [rows[c] for c in distinct(motions[rows], box, 0.02, len(rows))]
 
 
 def stack_motions(motions: list[SE3]) -> SE3:

@@ -1,10 +1,11 @@
 """The photos as judges of motion hypotheses."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from scipy.optimize import minimize_scalar
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -17,7 +18,7 @@ from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
 _ALPHA_WEIGHT = 0.5  # of the mask's error beside the colour's
-_FEW = 5  # photos that do for a quick look
+_FEW = 4  # photos of either state that do for a quick look
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
 
@@ -51,10 +52,15 @@ class Scene:
         views = self.views[:_FEW] if quick else self.views
         return float(np.mean([float(self.loss(moved, int(v))) for v in views]))
 
-    @torch.no_grad()
-    def absent(self, part: Splats) -> float:
+    @cached_property
+    def absent(self) -> float:
         """Mean error of the judging photos without the part."""
-        return float(np.mean([float(self.loss(part[:0], int(v))) for v in self.views]))
+        return self.error(self.rest[:0], SE3.identity(dtype=torch.float64))
+
+    @cached_property
+    def absent_quick(self) -> float:
+        """The same of the few photos of a quick look."""
+        return self.error(self.rest[:0], SE3.identity(dtype=torch.float64), quick=True)
 
     @torch.no_grad()
     def footprint(self, part: Splats) -> float:
@@ -62,6 +68,11 @@ class Scene:
         both = Splats.concatenate([self.rest, part])
         chosen = torch.arange(len(both)) >= len(self.rest)
         return float(np.mean([painted_share(both, chosen, self.look.stack.cameras[v]) for v in self.views]))
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels the judging photos have."""
+        return self.look.stack.alpha[self.views].size
 
     def support(self, part: Splats, motions: SE3) -> Float64[np.ndarray, "M N"]:
         """What each splat of a part takes off the photos' error under each of M motions of the part.
@@ -83,102 +94,160 @@ class Scene:
                 row += painted[len(self.rest) :, 0].sum(-1).double().numpy() / SH_C0
         return rows
 
-    def judge(self, hypothesis: Hypothesis, part: Splats, quick: bool = False) -> Hypothesis:
-        """The hypothesis with its image error."""
-        return replace(hypothesis, image_error=self.error(part, hypothesis.motion, quick))
-
-    def moved(self, hypothesis: Hypothesis, motion: SE3, box: Box) -> Hypothesis:
-        """The hypothesis with another motion of its box; what masks and photos say is still that of the old one."""
-        return replace(hypothesis, motion=motion, oddity=oddity(motion, box, self.still))
-
 
 def _errors(picture: Render, rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
     """What `Scene.loss` is the mean of."""
     return (picture.rgb - rgb).abs().mean(-1) + _ALPHA_WEIGHT * (picture.alpha - alpha).abs()
 
 
-def refine(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, steps: int, rate: float) -> Hypothesis:
-    """The hypothesis after the photos have pulled its motion into place, with its new image error.
+@dataclass(frozen=True)
+class Trial:
+    """A part between the photos of both states.
+
+    Laid where it was in the other state, the part has to explain that state's photos; and what lies there in the other state,
+    brought back, has to explain those of its own.  What was shut shows little of itself in the one, but all in the other.
+
+    Attributes:
+        there: photos of the other state, and the rest of the part's own state as it stands in them.
+        here: photos of the part's own state, and the rest of the other state as it stands in them.
+        others: all splats of the other state, in the world.
+        piece: the part's splats, in its own state.
+        box: the part's box in its own state.
+        weight: what the photos of the part's own state would lose without it, in mean error.
+        most: what it can explain of either: its weight, with that of what moves along.
+        near: how far from the moved box splats count as lying there, world units.
+    """
+
+    there: Scene
+    here: Scene
+    others: Splats
+    piece: Splats
+    box: Box
+    weight: float
+    most: float
+    near: float
+
+    @property
+    def absent(self) -> float:
+        """Error of the photos of both states without the part."""
+        return self.there.absent + self.here.absent
+
+    def lies(self, motion: SE3) -> Bool[Tensor, " N"]:
+        """Which splats of the other state lie where a motion takes the part."""
+        return self.box.moved(motion).contains(self.others.means.double(), margin=self.near)
+
+    def brought(self, motion: SE3) -> Splats:
+        """These splats, in the other state."""
+        return self.others[self.lies(motion)]
+
+    def judge(self, hypothesis: Hypothesis, quick: bool = False) -> Hypothesis:
+        """The hypothesis with its errors."""
+        there = self.there.error(self.piece, hypothesis.motion, quick)
+        here = self.here.error(self.brought(hypothesis.motion), hypothesis.motion.inverse(), quick)
+        return replace(hypothesis, image_error=there, back_error=here)
+
+    def moved(self, hypothesis: Hypothesis, motion: SE3) -> Hypothesis:
+        """The hypothesis with another motion; what masks and photos say is still that of the old one."""
+        return replace(hypothesis, motion=motion, oddity=oddity(motion, self.box, self.there.still))
+
+    def explained(self, hypothesis: Hypothesis, quick: bool = False) -> float:
+        """What a judged hypothesis takes off the errors of either state's photos, together.
+
+        What takes more than `most` off one takes another part's place, which says nothing for it.
+        """
+        without = [scene.absent_quick if quick else scene.absent for scene in (self.there, self.here)]
+        return sum(min(a - b, self.most) for a, b in zip(without, (hypothesis.image_error, hypothesis.back_error), strict=True))
+
+    def cost(self, hypothesis: Hypothesis, quick: bool = False) -> float:
+        """What hypotheses are compared by: what speaks against them, less what they explain."""
+        return hypothesis.against(self.weight) - self.explained(hypothesis, quick)
+
+    def gain(self, hypothesis: Hypothesis) -> float:
+        """Fraction that the part takes off the error of both states' photos."""
+        return (self.absent - hypothesis.error) / self.absent
+
+
+def refine(hypothesis: Hypothesis, trial: Trial, steps: int, rate: float) -> Hypothesis:
+    """The hypothesis after the photos have pulled its motion into place, with its new errors.
 
     Args:
-        hypothesis: the motion to start from, from the part's state to the photos'.
-        scene: the photos, and the rest.
-        part: the part's splats in its own state.
-        box: the part's box in its own state; turns are about its moved centre, and `rate` counts in its half diagonal.
-        steps: optimiser steps, one photo each.
+        hypothesis: the motion to start from, from the part's state to the other, with its errors.
+        trial: the part between the photos; turns are about its moved centre, and `rate` counts in its half diagonal.
+        steps: optimiser steps, one photo of either state each.
         rate: of the tangent at the start; falls to a tenth.
     """
+    box = trial.box
     reach = float(box.half_extents.norm())
     centre = hypothesis.motion.apply(box.T_world_box.xyz).float()
     start = hypothesis.motion.to(dtype=torch.float32)
+    brought = trial.brought(hypothesis.motion)
     unit = torch.tensor([reach] * 3 + [1.0] * 3)
     tangent = torch.zeros(6, requires_grad=True)
     optimiser = torch.optim.Adam([tangent], lr=rate, betas=(0.8, 0.95))
-    rounds = steps // len(scene.views) + 1
-    order = np.concatenate([np.random.default_rng(turn).permutation(len(scene.views)) for turn in range(rounds)])
+    orders = [_order(len(scene.views), steps) for scene in (trial.there, trial.here)]
     for step in range(steps):
         optimiser.param_groups[0]["lr"] = rate * 0.1 ** (step / steps)
         motion = turn_about(centre, tangent * unit) @ start
-        loss = scene.loss(part.moved(motion), int(scene.views[order[step]]))
+        there, here = (int(scene.views[order[step]]) for scene, order in zip((trial.there, trial.here), orders, strict=True))
+        loss = trial.there.loss(trial.piece.moved(motion), there) + trial.here.loss(brought.moved(motion.inverse()), here)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     motion = (turn_about(centre, (tangent * unit).detach()) @ start).to(dtype=torch.float64)
-    moved = scene.moved(hypothesis, motion, box)
-    return min(scene.judge(hypothesis, part), scene.judge(moved, part), key=lambda h: h.image_error)
+    return min(hypothesis, trial.judge(trial.moved(hypothesis, motion)), key=lambda h: h.error)
 
 
-def simplest(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box, base: Box, absent: float) -> Hypothesis:
+def _order(count: int, steps: int) -> Int64[np.ndarray, " S"]:
+    """Which of so many photos each step looks at: each once in a round."""
+    return np.concatenate([np.random.default_rng(turn).permutation(count) for turn in range(steps // count + 1)])
+
+
+def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> Hypothesis:
     """The hypothesis, or the simplest motion near it that the photos like about as well.
 
     A few photos of a small part hardly tell a slide from a slide with a little turn, or one along the box from one a little
     askew; joints are built along boxes, and they turn or slide.  Tried in turn: the slide and the turn along an axis of
-    the box or the base, the slide, the turn.
+    the base or the box, the slide, the turn.
 
     Args:
-        hypothesis: a motion with its image error.
-        scene: the photos, and the rest.
-        part: the part's splats in its own state.
-        box: the part's box in its own state.
+        hypothesis: a motion with its errors.
+        trial: the part between the photos.
         base: the base's box.
-        absent: error of the photos without the part; what the part takes off it is what "about as well" counts in.
+        share: "about as well" is less than this share of what the part takes off the photos' error.
     """
+    box = trial.box
     motion, centre = hypothesis.motion, box.T_world_box.xyz
     slide, length = screw_at(motion, "prismatic", centre)
     turn, angle = screw_at(motion, "revolute", centre)
-    axes = torch.cat([box.T_world_box.rotation.T, base.T_world_box.rotation.T])
     candidates = [(slide, length), (turn, angle)]
     for screw, q in ((turn, angle), (slide, length)):
-        along = axes @ screw.axis
-        nearest = int(along.abs().argmax())
-        if abs(float(along[nearest])) > np.cos(np.deg2rad(15)):
-            candidates.insert(0, (replace(screw, axis=axes[nearest]), q * float(along[nearest])))
-    enough = hypothesis.image_error + 0.05 * max(absent - hypothesis.image_error, 0.0) + NOISE * absent
+        for axes in (box.T_world_box.rotation.T, base.T_world_box.rotation.T):
+            along = axes @ screw.axis
+            nearest = int(along.abs().argmax())
+            if abs(float(along[nearest])) > np.cos(np.deg2rad(20)):
+                candidates.insert(0, (replace(screw, axis=axes[nearest]), q * float(along[nearest])))
+    enough = hypothesis.error + share * max(trial.absent - hypothesis.error, 0.0) + NOISE * trial.absent
     for screw, q in candidates:
-        simple = screw.motion(q)
-        judged = scene.judge(scene.moved(hypothesis, simple, box), part)
-        if judged.image_error < enough:
+        judged = trial.judge(trial.moved(hypothesis, screw.motion(q)))
+        if judged.error < enough:
             return judged
     return hypothesis
 
 
-def measured(hypothesis: Hypothesis, scene: Scene, part: Splats, box: Box) -> Hypothesis:
+def measured(hypothesis: Hypothesis, trial: Trial) -> Hypothesis:
     """The hypothesis, turned or slid a little more or less along its own axis as the photos see it, within a tenth.
 
     Args:
-        hypothesis: a motion with its image error.
-        scene: the photos, and the rest.
-        part: the part's splats in its own state.
-        box: the part's box in its own state.
+        hypothesis: a motion with its errors.
+        trial: the part between the photos.
     """
-    screw, q = screw_at(hypothesis.motion, kind_of(hypothesis.motion), box.T_world_box.xyz)
+    screw, q = screw_at(hypothesis.motion, kind_of(hypothesis.motion), trial.box.T_world_box.xyz)
 
     found = minimize_scalar(
-        lambda at: scene.error(part, screw.motion(float(at))),
+        lambda at: trial.judge(replace(hypothesis, motion=screw.motion(float(at)))).error,
         bounds=(0.9 * q, 1.1 * q),
         method="bounded",
-        options={"maxiter": 12},
+        options={"maxiter": 8},
     )
     q = float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
-    again = scene.judge(replace(hypothesis, motion=screw.motion(q)), part)
-    return min(hypothesis, again, key=lambda h: h.image_error)
+    return min(hypothesis, trial.judge(replace(hypothesis, motion=screw.motion(q))), key=lambda h: h.error)

@@ -2,189 +2,79 @@
 
 import itertools
 from collections.abc import Generator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..capture import spread_cameras
 from ..geometry import SE3, Box, screw_at
 from ..joints import kind_of
-from ..model import Splats
-from .cue import Cluster, CueConfig, StateLook, box_around, clusters
-from .divide import FACTORS, divide
-from .hypotheses import Hypothesis, candidate_motions, displacements, distinct, flips, hull_scores, oddity, stack_motions
-from .judge import NOISE, Scene, measured, refine, simplest
-
-
-@dataclass(frozen=True)
-class SearchConfig:
-    """How widely motions are searched."""
-
-    cue: CueConfig = field(default_factory=CueConfig)
-    """The motion cue."""
-    most: int = 12
-    """Clusters that are looked at, the largest first, of twice as many."""
-    mixed: float = 1.6
-    """A cluster holds several parts if its splats, each with as much or as little of the motion as suits it, would take this
-    many times as much off the photos' error as with one motion for all; of single parts it is .95 to 1.25 times..."""
-    divided: float = 0.06
-    """...and by more than this share of the cluster's weight: what hardly shows in the other state says nothing."""
-    together: int = 3
-    """A part may show as several clusters of a state: the boxes of so many with any one are laid upon the other state's."""
-    there: float = 0.12
-    """A cluster whose absence costs the photos of its own state less than this, in mean error of the pixels that show it, is
-    no surface, but splats in the air before one that few views see; surfaces come out at .15 to 1, these below .1."""
-    clear: float = 3.0
-    """Splats this near to a cluster's box, in voxels, belong to it."""
-    shortlist: int = 110
-    """Hypotheses per cluster that pass the hull and are shown to the photos."""
-    finalists: int = 3
-    """Distinct hypotheses per cluster that the photos pull into place: so many of the photos' choice and of the masks'."""
-    looks: int = 16
-    """Photos of the other state that judge the shortlist."""
-    steps: int = 40
-    """Optimiser steps for each finalist."""
-    rate: float = 0.03
-    """Of a finalist's pose: radians, and parts of the box's half diagonal."""
-    same: float = 0.15
-    """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
-    alike: float = 0.12
-    """...and if moving it just like the other costs the photos less than this fraction of the part's weight."""
-    shown: float = 0.2
-    """Clusters are moved together if the photos of the other state then show this share of the weight of each."""
-    large: float = 0.01
-    """A part that holds this fraction of its state's points came from somewhere: it is kept if it does little harm..."""
-    harm: float = 0.01
-    """...and adds less than this fraction to the photo error; what is shut may show in no photo."""
-
-
-@dataclass(frozen=True)
-class MovingPart:
-    """A rigid part as the search found it.
-
-    Attributes:
-        state: the state whose cluster it was found by.
-        pieces: points of its surface, in that state, in the world: those of each cluster that it was found as.
-        hypothesis: its motion from `state` to the other state.
-        gain: fraction that it takes off the error of the other state's photos.
-        weight: what the photos of its own state would lose without it, in mean error.
-        rivals: what the photos thought of the next best distinct motions.
-    """
-
-    state: int
-    pieces: tuple[Float64[np.ndarray, "_ 3"], ...]
-    hypothesis: Hypothesis
-    gain: float
-    weight: float
-    rivals: tuple[Hypothesis, ...] = ()
-
-    @property
-    def points(self) -> Float64[np.ndarray, "P 3"]:
-        """All of its points, in its own state."""
-        return np.concatenate(self.pieces)
-
-    @property
-    def motion(self) -> SE3:
-        """From state 0 to state 1, in the world, float64."""
-        return self.hypothesis.motion.inverse() if self.state else self.hypothesis.motion
-
-    def points_in(self, state: int) -> Float64[np.ndarray, "P 3"]:
-        """Its points as they stand in a state."""
-        points = torch.from_numpy(self.points)
-        return (points if state == self.state else self.hypothesis.motion.apply(points)).numpy()
+from .config import SearchConfig
+from .cue import Cluster, Points, StateLook, linked
+from .divide import FACTORS, cut_fronts, divide
+from .hypotheses import (
+    Hypothesis,
+    candidate_motions,
+    displacements,
+    distinct,
+    finalists,
+    flips,
+    hull_scores,
+    oddity,
+    stack_motions,
+)
+from .judge import NOISE, Scene, Trial, measured
+from .pieces import MovingPart, Pieces
 
 
 class PartSearch:
     """Turns clusters into moving parts, one after the other, the largest first."""
 
     def __init__(self, looks: tuple[StateLook, StateLook], config: SearchConfig, seed: int):
-        self.looks = looks
+        self.pieces = Pieces(looks, config, seed)
         self.config = config
-        self.generator = np.random.default_rng(seed)
-        self.voxel = looks[0].hull.voxel
-        found = clusters(looks, config.cue)
-        still = self._still_points(found)
-        self.base_box, self.still = self._box(still), KDTree(still)
-        moving = [[cluster.points for cluster in found if cluster.state == state] for state in (0, 1)]
-        self.moving = [KDTree(np.concatenate([np.zeros((0, 3)), *points])) for points in moving]
-        # Of each cluster: its box, its splats among its state's, and what the photos of its state lose without it.
-        self.clusters: list[Cluster] = []
-        self.boxes: list[Box] = []
-        self.held: list[Bool[Tensor, " N"]] = []
-        self.weights: list[float] = []
-        self.apart: dict[int, int] = {}  # clusters that were one but do not move together, with that one's index
-        for cluster in found[: 2 * config.most]:
-            if len(self.clusters) < config.most:
-                self._take(cluster)
         self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
 
-    def _box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
-        return box_around(points, thinnest=0.5 * self.voxel)
-
-    def _still_points(self, found: list[Cluster]) -> Float64[np.ndarray, "P 3"]:
-        """Points of either state that none of these clusters holds; all points of state 0 where they hold everything."""
-        rows = []
-        for state, look in enumerate(self.looks):
-            still = np.ones(len(look.points), bool)
-            for cluster in found:
-                if cluster.state == state:
-                    still &= ~self._box(cluster.points).contains(torch.from_numpy(look.points), margin=self.voxel).numpy()
-            rows.append(look.points[still])
-        return max(rows, key=len) if any(map(len, rows)) else self.looks[0].points
-
-    def _take(self, cluster: Cluster) -> None:
-        """Takes a cluster among those to explain, if the photos of its own state need it where they show it."""
-        splats = self.looks[cluster.state].splats
-        held = self._held(cluster.points, cluster.state)
-        scene, piece = self._scene(cluster.state, splats[~held]), splats[held]
-        weight = scene.absent(piece) - scene.error(piece, SE3.identity(dtype=torch.float64))
-        if weight > self.config.there * scene.footprint(piece):
-            self.clusters.append(cluster)
-            self.boxes.append(self._box(cluster.points))
-            self.held.append(held)
-            self.weights.append(weight)
-
-    def _divided(self, part: MovingPart, members: set[int], parts: list[MovingPart]) -> list[int]:
-        """Indices of new clusters in place of those of a part, if these turn out to be several parts; none otherwise."""
-        box = self._box(part.points)
+    def _divided(self, part: MovingPart, trial: Trial, known_cut: bool) -> list[Points]:
+        """The points of a part as those of several, if it turns out to be several parts; else all of them."""
+        config, box = self.config, trial.box
         screw, q = screw_at(part.hypothesis.motion, kind_of(part.hypothesis.motion), box.T_world_box.xyz)
-        piece = self._piece(members)
-        scene = self._scene(1 - part.state, self._rest(parts, part.state))
-        support = scene.support(piece, screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64)))
-        means = piece.means.double().numpy()
-        least = self.config.divided * part.weight * scene.look.stack.alpha[scene.views].size
-        pieces = divide(part.points, means, support, self.config.mixed, least, self.config.cue, self.voxel)
-        before = len(self.clusters)
-        if len(pieces) > 1:
-            for points in sorted(pieces, key=len, reverse=True):
-                self._take(Cluster(part.state, points))
-            origin = self.apart.get(min(members), min(members))
-            self.apart |= dict.fromkeys(range(before, len(self.clusters)), origin)
-        return list(range(before, len(self.clusters)))
+        motions = screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
+        if trial.there.absent - part.hypothesis.image_error > config.shows * part.weight:
+            support = trial.there.support(trial.piece, motions)
+            least = config.divided * part.weight * trial.there.pixels
+            means = trial.piece.means.double().numpy()
+            return divide(part.points, means, support, config.mixed, least, config.cue, self.pieces.voxel)
+        if known_cut:
+            return [part.points]
+        nears = [replace(trial, near=0.0).lies(motions[f]) for f in range(len(FACTORS))]
+        fronts = trial.others[torch.stack(nears).any(0)]
+        there = box.moved(part.hypothesis.motion)
+        support = trial.here.support(fronts, motions.inverse())
+        return cut_fronts(part.points, box, there.to_canonical(fronts.means.double()).numpy(), support, screw)
 
-    def _splats_of(self, part: MovingPart) -> Splats:
-        """A part's splats in its own state: its pieces', as one box around all may hold some of the base."""
-        held = [self._held(points, part.state) for points in part.pieces]
-        return self.looks[part.state].splats[torch.stack(held).any(0)]
+    def _replaced(self, index: int, points: list[Points]) -> list[int]:
+        """Indices of new clusters in place of one; these do not move together."""
+        state, before = self.pieces.clusters[index].state, len(self.pieces)
+        for some in sorted(points, key=len, reverse=True):
+            self.pieces.take(Cluster(state, some))
+        new = range(before, len(self.pieces))
+        self.pieces.apart |= dict.fromkeys(new, self.pieces.apart.get(index, index))
+        return list(new)
 
-    def _held(self, points: Float64[np.ndarray, "P 3"], state: int) -> Bool[Tensor, " N"]:
-        """Which splats of a state lie in the box of points or near it, and no nearer to what else moved."""
-        means = self.looks[state].splats.means.double()
-        held = self._box(points).contains(means, margin=self.config.clear * self.voxel)
-        inside = means[held].numpy()
-        held[held.clone()] = torch.from_numpy(
-            KDTree(points).query(inside)[0] < self.moving[state].query(inside)[0] + 0.5 * self.voxel
-        )
-        return held
-
-    def _scene(self, state: int, rest: Splats) -> Scene:
-        """A state's photos, some that are well apart, as judges of a part among all the rest."""
-        views = spread_cameras(self.looks[state].stack.cameras, self.config.looks)
-        return Scene(self.looks[state], rest, np.array(views), self.still)
+    def _left_of(self, index: int, parts: list[MovingPart]) -> list[int]:
+        """What is left to explain of a cluster, by indices: itself, if no part lies there, or new clusters in its place."""
+        cluster = self.pieces.clusters[index]
+        within = [self._within(part, cluster).numpy() for part in parts]
+        share = float(np.any(within, 0).mean()) if parts else 0.0
+        if share < 0.1:
+            return [index]
+        if share > 0.6:
+            return []
+        return self._replaced(index, linked(cluster.points[~np.any(within, 0)], self.config.cue, self.pieces.voxel))
 
     def search(self, count: int | None) -> list[MovingPart]:
         """The moving parts with the motions that the photos prefer: all that explain something, or the `count` best."""
@@ -197,22 +87,41 @@ class PartSearch:
 
     def steps(self) -> Generator[int, None, list[MovingPart]]:
         """The search, bit by bit: yields how many clusters are done with, and returns the parts, the best first."""
+        found = yield from self._found()
+        parts = self._reconsider([self._at_its_clearest(part) for part in found])
+        return sorted(self._settled(self._without_pieces(parts)), key=lambda part: -part.weight)
+
+    def _found(self) -> Generator[int, None, list[MovingPart]]:
+        """The parts as they are found, one after the other."""
         parts: list[MovingPart] = []
         explained: set[int] = set()
         refused: dict[int, tuple[int, float]] = {}
-        count = len(self.clusters)
+        count = len(self.pieces)
         todo = list(range(count))
+        waiting: set[int] = set()  # clusters that may be several parts: those of the other state may tell them apart
+        waited: set[int] = set()
         while todo:
             index = todo.pop(0)
             yield min(index, count)
+            if index in waiting:
+                waiting.remove(index)
+                todo = self._left_of(index, parts) + todo
+                continue
             if index in explained:
                 continue
-            part, members = self._try(index, parts, explained)
-            if part.gain > NOISE and (pieces := self._divided(part, members, parts)):
-                explained |= members
-                todo = pieces + todo
+            part, members, trial = self._try(index, parts, explained)
+            several = self._divided(part, trial, index in self.pieces.apart) if part.gain > NOISE else [part.points]
+            doubtful = len(several) > 1 or trial.explained(part.hypothesis) < self.config.clear_case * trial.most
+            if doubtful and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
+                waiting.add(index)
+                waited.add(index)
+                todo.append(index)
                 continue
-            share = len(part.points) / len(self.looks[part.state].points)
+            if len(several) > 1:
+                explained |= members
+                todo = self._replaced(min(members), several) + todo
+                continue
+            share = len(part.points) / len(self.pieces.looks[part.state].points)
             large = share > self.config.large
             if part.gain < (-self.config.harm if large else NOISE):
                 if large:
@@ -221,8 +130,28 @@ class PartSearch:
             parts.append(part)
             explained |= members | self._explained_by(part)
         self.left_over = [what for index, what in refused.items() if index not in explained]
-        parts = self._settled(self._without_pieces(self._reconsider(parts)))
-        return sorted(parts, key=lambda part: -part.weight)
+        return parts
+
+    def _is_open(self, state: int, todo: set[int]) -> bool:
+        return any(self.pieces.clusters[index].state == state for index in todo)
+
+    def _at_its_clearest(self, part: MovingPart) -> MovingPart:
+        """The part as the other state shows it, if it is as large there but thinner.
+
+        Where few views look along a panel, the hull carries more than the panel, and what is fitted to it lies askew.
+        """
+        pieces, other = self.pieces, 1 - part.state
+        there = [i for i in sorted(self._explained_by(part)) if pieces.clusters[i].state == other]
+        if not there:
+            return part
+        points = tuple(pieces.clusters[i].points for i in there)
+        now, then = pieces.box(part.points), pieces.box(np.concatenate(points))
+        smaller = then.half_extents.sort()[0] / now.half_extents.sort()[0]
+        if float(smaller.prod()) > self.config.thinner or float(smaller[1:].min()) < 0.8:
+            return part
+        back = [replace(h, motion=h.motion.inverse()) for h in (part.hypothesis, *part.rivals)]
+        weight = sum(pieces.weights[i] for i in there)
+        return replace(part, state=other, pieces=points, hypothesis=back[0], rivals=tuple(back[1:]), weight=weight)
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
         """Looks at each part again with all others in place; one that may as well move like another becomes one with it."""
@@ -230,40 +159,38 @@ class PartSearch:
         index = 0
         while index < len(parts) > 1:
             part, others = parts[index], parts[:index] + parts[index + 1 :]
-            state = part.state
-            box, piece, scene, absent = self._again(part, others)
-            shared = [p.motion if state == 0 else p.motion.inverse() for p in others]
+            trial = self._again(part, others)
+            shared = [p.motion if part.state == 0 else p.motion.inverse() for p in others]
             own = part.hypothesis
-            guests = [scene.moved(own, T, box) for T in shared]
-            starts = [own, *part.rivals[:2], *guests]
-            again = [self._pulled(h, scene, piece, box, absent, part.weight, self.config.steps) for h in starts]
-            by_cost = sorted(again, key=lambda h: h.cost(part.weight))
-            gaps = displacements(stack_motions(shared), by_cost[0].motion, box)
-            as_they_move = np.array([scene.error(piece, T) for T in shared])
-            losses = as_they_move - min(h.image_error for h in again)
+            starts = [own, *part.rivals[:2], *(trial.moved(own, T) for T in shared)]
+            again = [self.pieces.pulled(h, trial, self.config.steps) for h in starts]
+            by_cost = sorted(again, key=trial.cost)
+            gaps = displacements(stack_motions(shared), by_cost[0].motion, trial.box)
+            as_they_move = [trial.judge(trial.moved(own, T)) for T in shared]
+            losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
-            needless = as_they_move < min(h.cost(part.weight) for h in again[: -len(shared)])
+            best_of_its_own = min(h.error + h.against(part.weight) for h in again[: -len(shared)])
+            needless = np.array([h.error for h in as_they_move]) < best_of_its_own
             alike |= needless & np.array([other.weight > part.weight and self._continues(part, other) for other in others])
 
-            twin = int(np.argmin(np.where(alike, as_they_move, np.inf)))
+            twin = int(np.argmin(np.where(alike, losses, np.inf)))
             if alike[twin]:
                 follower, leader = sorted((part, others[twin]), key=lambda p: p.weight)
                 parts = self._merged(leader, follower, [p for p in others if p is not others[twin]])
                 index = 0
                 continue
-            again = by_cost
-            chosen = distinct(stack_motions([h.motion for h in again]), box, 0.1, len(again))
-            parts[index] = replace(part, hypothesis=again[0], rivals=tuple(again[c] for c in chosen[1:]))
+            chosen = distinct(stack_motions([h.motion for h in by_cost]), trial.box, 0.1, len(by_cost))
+            parts[index] = replace(part, hypothesis=by_cost[0], rivals=tuple(by_cost[c] for c in chosen[1:]))
             index += 1
         return parts
 
     def _continues(self, part: MovingPart, other: MovingPart) -> bool:
         """Whether two parts touch where the one was found (the clustering's reach), and one box holds both about as well."""
         theirs = other.points_in(part.state)
-        if KDTree(theirs).query(part.points)[0].min() > self.config.cue.link * self.voxel:
+        if KDTree(theirs).query(part.points)[0].min() > self.config.cue.link * self.pieces.voxel:
             return False
-        whole, *both = (float(self._box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
+        whole, *both = (float(self.pieces.box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
         return sum(both) > self.config.cue.hollow * whole
 
     def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
@@ -272,39 +199,29 @@ class PartSearch:
         for part in sorted(parts, key=lambda part: -len(part.points)):
             points = torch.from_numpy(part.points)
             within = [
-                self._box(whole.points_in(part.state)).contains(points, margin=3 * self.voxel).double().mean() for whole in kept
+                self.pieces.box(whole.points_in(part.state)).contains(points, margin=3 * self.pieces.voxel).double().mean()
+                for whole in kept
             ]
             if not within or max(within) < 0.6:
                 kept.append(part)
         return kept
 
-    def _again(self, part: MovingPart, others: list[MovingPart]) -> tuple[Box, Splats, Scene, float]:
-        """A part's box and splats, the photos of the other state with all other parts in place, and their error without it."""
-        box = self._box(part.points)
-        other = 1 - part.state
-        scene = self._scene(other, self._rest(others, part.state))
-        piece = self._splats_of(part)
-        return box, piece, scene, scene.absent(piece)
+    def _again(self, part: MovingPart, others: list[MovingPart]) -> Trial:
+        """A part between the photos of both states, with all other parts in place."""
+        return self.pieces.trial(part.state, part.points, self.pieces.splats_of(part), part.weight, others)
 
     def _settled(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts after a longer look at each and the ways it can lie, with the motions of the others as they now are."""
         parts = list(parts)
         for index, part in enumerate(parts):
-            box, piece, scene, absent = self._again(part, parts[:index] + parts[index + 1 :])
+            trial = self._again(part, parts[:index] + parts[index + 1 :])
             own = part.hypothesis
-            starts = [own, *part.rivals[:1], *(scene.moved(own, T, box) for T in flips(own.motion, box))]
-            again = [self._pulled(h, scene, piece, box, absent, part.weight, 2 * self.config.steps) for h in starts]
-            best = min(again, key=lambda h: h.cost(part.weight))
-            parts[index] = replace(part, hypothesis=measured(best, scene, piece, box))
+            ways = [own, *part.rivals[:1], *(trial.moved(own, T) for T in flips(own.motion, trial.box))]
+            costs = [trial.cost(trial.judge(h)) for h in ways]
+            hopeful = [h for h, cost in zip(ways, costs, strict=True) if cost < costs[0] + self.config.hopeless * part.weight]
+            again = [self.pieces.pulled(h, trial, 2 * self.config.steps) for h in hopeful]
+            parts[index] = replace(part, hypothesis=measured(min(again, key=trial.cost), trial))
         return parts
-
-    def _pulled(
-        self, start: Hypothesis, scene: Scene, piece: Splats, box: Box, absent: float, weight: float, steps: int
-    ) -> Hypothesis:
-        """The simplest motion that does where the photos pull a hypothesis, or the hypothesis, if all in all it is better."""
-        refined = refine(start, scene, piece, box, steps, self.config.rate)
-        simple = simplest(refined, scene, piece, box, self.base_box, absent)
-        return min(simple, scene.judge(start, piece), key=lambda h: h.cost(weight))
 
     def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
         """The parts with two of them made one, which moves as the leader does."""
@@ -316,132 +233,106 @@ class PartSearch:
         )
         return [replace(leader, pieces=leader.pieces + there), *rest]
 
+    def _within(self, part: MovingPart, cluster: Cluster) -> Bool[Tensor, " P"]:
+        """Which points of a cluster of either state lie where the part is in that state."""
+        box = self.pieces.box(part.points)
+        there = box if cluster.state == part.state else box.moved(part.hypothesis.motion)
+        return there.contains(torch.from_numpy(cluster.points), margin=3 * self.pieces.voxel)
+
     def _explained_by(self, part: MovingPart) -> set[int]:
         """Clusters of either state that lie where the part is in that state."""
-        box = self._box(part.points)
-        found = set()
-        for index, cluster in enumerate(self.clusters):
-            there = box if cluster.state == part.state else box.moved(part.hypothesis.motion)
-            if float(there.contains(torch.from_numpy(cluster.points), margin=3 * self.voxel).double().mean()) > 0.6:
-                found.add(index)
-        return found
+        clusters = enumerate(self.pieces.clusters)
+        return {index for index, cluster in clusters if float(self._within(part, cluster).double().mean()) > 0.6}
 
-    def _try(self, index: int, parts: list[MovingPart], done: set[int]) -> tuple[MovingPart, set[int]]:
-        """The best motion of one cluster.
-
-        Returns:
-            The part, and the indices of the clusters that move with it in its own state.
-        """
-        cluster, box = self.clusters[index], self.boxes[index]
+    def _shortlist(self, index: int, done: set[int]) -> tuple[list[Hypothesis], list[int]]:
+        """Motions that the other state's hull allows a cluster, the best first, and the clusters that may move with it."""
+        pieces = self.pieces
+        cluster, box = pieces.clusters[index], pieces.boxes[index]
         state, other = cluster.state, 1 - cluster.state
-        target = self.looks[other]
-        open_ = [i for i in range(len(self.clusters)) if i not in done]
-        arrivals = [i for i in open_ if self.clusters[i].state == other]
-        siblings = [i for i in open_ if self.clusters[i].state == state and i != index and not self._known_apart(i, index)]
+        hull, nothing = pieces.looks[other].hull, np.zeros((0, 3))
+        open_ = [i for i in range(len(pieces)) if i not in done]
+        arrivals = [i for i in open_ if pieces.clusters[i].state == other]
+        siblings = [i for i in open_ if pieces.clusters[i].state == state and i != index and not self._known_apart(i, index)]
         wholes = self._unions(siblings, {index})
-        pairs = list(itertools.product(wholes, self._unions(arrivals, set())))
-        motions = candidate_motions(wholes, self.base_box, pairs)
-        landing = np.concatenate([self.clusters[i].points for i in arrivals]) if arrivals else np.zeros((0, 3))
-        nothing = np.zeros((0, 3))
-        rough = hull_scores(motions, self._sample(cluster.points, 40), target.hull, nothing, box)[0]
+        motions = candidate_motions(wholes, pieces.base_box, list(itertools.product(wholes, self._unions(arrivals, set()))))
+        landing = np.concatenate([pieces.clusters[i].points for i in arrivals]) if arrivals else nothing
+        rough = hull_scores(motions, pieces.sample(cluster.points, 40), hull, nothing, box)[0]
         motions = motions[np.flatnonzero(rough < rough.min() + 1.0)]
-        points, landing = self._sample(cluster.points, 300), self._sample(landing, 300)
-        outside, unexplained = hull_scores(motions, points, target.hull, landing, box)
+        points, landing = pieces.sample(cluster.points, 300), pieces.sample(landing, 300)
+        outside, unexplained = hull_scores(motions, points, hull, landing, box)
         travel = displacements(motions, SE3.identity(dtype=torch.float64), box)
         ranked = np.argsort(outside + unexplained + 0.05 * travel, kind="stable")
         ranked = ranked[outside[ranked] < outside.min() + 0.5]
         ranked = ranked[distinct(motions[ranked], box, 0.12, self.config.shortlist)]
-        fits = {}
-        for i in siblings:
-            sample = self._sample(self.clusters[i].points, 100)
-            fits[i] = hull_scores(motions[ranked], sample, target.hull, nothing, self.boxes[i])[0] < 0.8
+        starts = []
+        for m in ranked.tolist():
+            odd = oddity(motions[m], box, pieces.still)
+            starts.append(Hypothesis(motions[m], float(outside[m]), float(unexplained[m]), odd))
+        return starts, siblings
 
-        scene = self._scene(other, self._rest(parts, state))
-        absent = scene.absent(target.splats)
-        judged: list[tuple[Hypothesis, frozenset[int]]] = []
-        for row, m in enumerate(ranked):
-            motion = motions[int(m)]
-            start = Hypothesis(motion, float(outside[m]), float(unexplained[m]), oddity(motion, box, self.still))
-            alone = scene.judge(start, self._piece({index}), quick=True)
-            judged.append((alone, frozenset()))
+    def _try(self, index: int, parts: list[MovingPart], done: set[int]) -> tuple[MovingPart, set[int], Trial]:
+        """The best motion of one cluster.
+
+        Returns:
+            The part, the indices of the clusters that move with it in its own state, and how it was tried.
+        """
+        pieces = self.pieces
+        box, state = pieces.boxes[index], pieces.clusters[index].state
+        starts, siblings = self._shortlist(index, done)
+        motions = stack_motions([start.motion for start in starts])
+        samples = {i: pieces.sample(pieces.clusters[i].points, 100) for i in siblings}
+        hull, nothing = pieces.looks[1 - state].hull, np.zeros((0, 3))
+        fits = {i: hull_scores(motions, samples[i], hull, nothing, pieces.boxes[i])[0] < 0.8 for i in siblings}
+        alone = pieces.trial(state, pieces.clusters[index].points, pieces.splats_in({index}), pieces.weights[index], parts)
+        judged: list[tuple[Hypothesis, frozenset[int], float]] = []
+        for row, start in enumerate(starts):
+            single = alone.judge(start, quick=True)
+            judged.append((single, frozenset(), alone.cost(single, quick=True)))
             if together := frozenset(i for i in siblings if fits[i][row]):
-                joined = scene.judge(start, self._piece({index, *together}), quick=True)
-                share = self.config.shown * sum(self.weights[i] for i in together)
-                if joined.image_error < alone.image_error - share:
-                    others = scene.error(self._piece(set(together)), motion, quick=True)
-                    if joined.image_error < others - self.config.shown * self.weights[index]:
-                        judged.append((joined, together))
-        weight = self.weights[index]
-        refined = []
-        for start, group in self._finalists(judged, box, weight):
-            piece = self._piece({index, *group})
-            refined.append((self._pulled(start, scene, piece, box, absent, weight, self.config.steps), group))
-        refined.sort(key=lambda row: row[0].cost(weight))
-        chosen = distinct(stack_motions([h.motion for h, _ in refined]), box, 0.1, len(refined))
-        refined = [refined[c] for c in chosen]
-        best, group = refined[0]
-        members = {index, *self._shown(best, index, group, scene)}
-        best = measured(best, scene, self._piece(members), box)
-        pieces = tuple(self.clusters[i].points for i in sorted(members))
-        gain = (absent - best.image_error) / absent
-        return MovingPart(state, pieces, best, gain, weight, tuple(rival for rival, _ in refined[1:])), members
+                trial = self._with(alone, index, together)
+                error = trial.there.error(trial.piece, start.motion, quick=True)
+                if error < single.image_error - self.config.shown * sum(pieces.weights[i] for i in together):
+                    others = alone.there.error(pieces.splats_in(set(together)), start.motion, quick=True)
+                    if error < others - self.config.shown * alone.weight:
+                        joined = replace(single, image_error=error)
+                        judged.append((joined, together, trial.cost(joined, quick=True)))
+        refined: list[tuple[Hypothesis, frozenset[int], float]] = []
+        motions = stack_motions([start.motion for start, _, _ in judged])
+        for row in finalists(motions, [cost for _, _, cost in judged], box, self.config.finalists):
+            start, group, _ = judged[row]
+            trial = self._with(alone, index, group)
+            pulled = pieces.pulled(start, trial, self.config.steps)
+            refined.append((pulled, group, trial.cost(pulled)))
+        refined.sort(key=lambda row: row[2])
+        chosen = distinct(stack_motions([h.motion for h, _, _ in refined]), box, 0.1, len(refined))
+        best, group, _ = refined[0]
+        members = {index, *self._shown(best, index, group, alone.there)}
+        trial = self._with(alone, index, frozenset(members - {index}))
+        best = measured(trial.judge(best), trial)
+        points = tuple(pieces.clusters[i].points for i in sorted(members))
+        rivals = tuple(refined[c][0] for c in chosen[1:])
+        return MovingPart(state, points, best, trial.gain(best), alone.weight, rivals), members, trial
+
+    def _with(self, alone: Trial, index: int, group: frozenset[int]) -> Trial:
+        """The trial of a cluster with what moves along."""
+        members = {index, *group}
+        most = sum(self.pieces.weights[i] for i in members)
+        return replace(alone, piece=self.pieces.splats_in(members), most=most)
 
     def _shown(self, best: Hypothesis, index: int, group: frozenset[int], scene: Scene) -> set[int]:
         """The clusters of a group that the photos miss if they do not move along."""
         if not group:
             return set()
-        everything = scene.error(self._piece({index, *group}), best.motion)
-        without = {i: scene.error(self._piece({index, *group} - {i}), best.motion) for i in group}
-        return {i for i, error in without.items() if error - everything > self.config.shown * self.weights[i]}
+        everything = scene.error(self.pieces.splats_in({index, *group}), best.motion)
+        without = {i: scene.error(self.pieces.splats_in({index, *group} - {i}), best.motion) for i in group}
+        return {i for i, error in without.items() if error - everything > self.config.shown * self.pieces.weights[i]}
 
     def _known_apart(self, one: int, other: int) -> bool:
-        return one in self.apart and self.apart[one] == self.apart.get(other)
+        return one in self.pieces.apart and self.pieces.apart[one] == self.pieces.apart.get(other)
 
     def _unions(self, indices: list[int], always: set[int]) -> list[Box]:
         """Boxes of what may be one part: the clusters in `always` with none, one, two or all of the largest others."""
         largest = indices[: self.config.together]
         groups = {frozenset(always | set(some)) for n in (0, 1, 2, len(largest)) for some in itertools.combinations(largest, n)}
-        points = [np.concatenate([self.clusters[i].points for i in sorted(g)]) for g in sorted(groups, key=sorted) if g]
-        return [self._box(p) for p in points]
-
-    def _finalists(
-        self, judged: list[tuple[Hypothesis, frozenset[int]]], box: Box, weight: float
-    ) -> list[tuple[Hypothesis, frozenset[int]]]:
-        """The best by the photos and, where these see little of a part or in another light, the best by the masks.
-
-        Args:
-            judged: hypotheses in the masks' order, each with the clusters that move along.
-            box: of the cluster.
-            weight: of the part in the photos of its own state (see `Hypothesis.cost`).
-        """
-        by_photos = sorted(judged, key=lambda row: row[0].cost(weight))
-        rows = []
-        for order in (by_photos, judged):
-            chosen = distinct(stack_motions([start.motion for start, _ in order]), box, 0.15, self.config.finalists)
-            rows += [order[c] for c in chosen]
-        return [rows[c] for c in distinct(stack_motions([start.motion for start, _ in rows]), box, 0.02, len(rows))]
-
-    def _piece(self, members: set[int]) -> Splats:
-        """The splats of the clusters in `members`, all of one state."""
-        splats = self.looks[self.clusters[min(members)].state].splats
-        return splats[torch.stack([self.held[i] for i in sorted(members)]).any(0)]
-
-    def _rest(self, parts: list[MovingPart], state: int) -> Splats:
-        """All that stands still in `state`, with the parts found so far as they stand in the other state."""
-        splats = self.looks[state].splats
-        moving = torch.zeros(len(splats), dtype=torch.bool)
-        for cluster, held in zip(self.clusters, self.held, strict=True):
-            if cluster.state == state:
-                moving |= held
-        return Splats.concatenate([splats[~moving], *self._placed(parts, state)])
-
-    def _placed(self, parts: list[MovingPart], state: int) -> list[Splats]:
-        """Splats of the parts found so far as they stand in the state other than `state`, each from the one that shows it."""
-        rows = []
-        for part in parts:
-            piece = self._splats_of(part)
-            rows.append(piece.moved(part.hypothesis.motion) if part.state == state else piece)
-        return rows
-
-    def _sample(self, points: Float64[np.ndarray, "P 3"], most: int) -> Float64[np.ndarray, "Q 3"]:
-        return points if len(points) <= most else points[self.generator.choice(len(points), most, replace=False)]
+        points = [np.concatenate([self.pieces.clusters[i].points for i in sorted(g)]) for g in sorted(groups, key=sorted) if g]
+        return [self.pieces.box(p) for p in points]

@@ -11,8 +11,10 @@ from ..capture import Capture, stack_views
 from ..geometry import SE3, Box
 from ..points import Clouds, Silhouettes, object_bounds
 from .appearance import AppearanceConfig, fit_state, surface_points
+from .config import SearchConfig
 from .cue import StateLook, box_around, clusters
-from .partition import MovingPart, PartSearch, SearchConfig
+from .partition import PartSearch
+from .pieces import MovingPart
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,20 @@ def boxes_of_parts(looks: tuple[StateLook, StateLook], parts: list[MovingPart], 
 
 
 def _still_points(looks: tuple[StateLook, StateLook], moving: list[tuple[Box, Box]]) -> Float64[np.ndarray, "P 3"]:
-    """What stands in the hulls of both states, outside the moving boxes, which are given as they lie in either state."""
+    """Surface points of either state in the hull of the other, outside the moving boxes, given as they lie in either state.
+
+    Where boxes hold everything, all that both hulls hold.
+    """
+    rows = []
+    for look, other in (looks, looks[::-1]):
+        points = torch.from_numpy(look.points)
+        still = torch.from_numpy(other.hull.sample(other.hull.distance(), look.points, outside=np.inf) <= other.hull.voxel)
+        for pair in moving:
+            for box in pair:
+                still &= ~box.contains(points)
+        rows.append(look.points[still.numpy()])
     hull = looks[0].hull
-    points = torch.from_numpy(hull.centres(hull.occupied & looks[1].hull.occupied))
-    free = torch.ones(len(points), dtype=torch.bool)
-    for pair in moving:
-        for box in pair:
-            free &= ~box.contains(points)
-    return points[free if free.any() else slice(None)].numpy()
+    return np.concatenate(rows) if any(map(len, rows)) else hull.centres(hull.occupied & looks[1].hull.occupied)
 
 
 def boxes_at_rest(looks: tuple[StateLook, StateLook], count: int | None, config: StartConfig) -> tuple[Box, SE3]:

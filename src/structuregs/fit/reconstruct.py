@@ -162,7 +162,7 @@ def start_parts(
 
 def _searched(search: PartSearch) -> Generator[FitEvent, None, list[MovingPart]]:
     """The moving parts that a search finds, its progress as events."""
-    clusters = len(search.clusters)
+    clusters = len(search.pieces)
     yield StageStarted("search", max(clusters, 1))
     steps = search.steps()
     while True:

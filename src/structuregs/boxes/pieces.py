@@ -1,0 +1,186 @@
+"""What the search works with: the clusters of what moved, the splats that each holds, and the photos that judge them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from ..capture import spread_cameras
+from ..geometry import SE3, Box
+from ..model import Splats
+from .config import SearchConfig
+from .cue import Cluster, Points, StateLook, box_around, clusters
+from .hypotheses import Hypothesis
+from .judge import Scene, Trial, refine, simplest
+
+
+@dataclass(frozen=True)
+class MovingPart:
+    """A rigid part as the search found it.
+
+    Attributes:
+        state: the state whose clusters and splats show it.
+        pieces: points of its surface, in that state, in the world: those of each cluster that it was found as.
+        hypothesis: its motion from `state` to the other state.
+        gain: fraction that it takes off the error of both states' photos.
+        weight: what the photos of its own state would lose without it, in mean error.
+        rivals: what the photos thought of the next best distinct motions.
+    """
+
+    state: int
+    pieces: tuple[Points, ...]
+    hypothesis: Hypothesis
+    gain: float
+    weight: float
+    rivals: tuple[Hypothesis, ...] = ()
+
+    @property
+    def points(self) -> Float64[np.ndarray, "P 3"]:
+        """All of its points, in its own state."""
+        return np.concatenate(self.pieces)
+
+    @property
+    def motion(self) -> SE3:
+        """From state 0 to state 1, in the world, float64."""
+        return self.hypothesis.motion.inverse() if self.state else self.hypothesis.motion
+
+    def points_in(self, state: int) -> Float64[np.ndarray, "P 3"]:
+        """Its points as they stand in a state."""
+        points = torch.from_numpy(self.points)
+        return (points if state == self.state else self.hypothesis.motion.apply(points)).numpy()
+
+
+class Pieces:
+    """The clusters of what moved, with the splats that each holds and what the photos would lose without it.
+
+    Attributes:
+        looks: of both states.
+        config: of the search.
+        voxel: of the hulls, world units.
+        views: of each state, which photos judge: some that are well apart.
+        still: points of what stands still.
+        base_box: around them.
+        moving: points of all clusters, by state.
+        clusters: those that are to be explained, the largest first.
+        boxes: of each cluster.
+        held: of each cluster, its splats among its state's.
+        weights: of each cluster, what the photos of its state lose without it, in mean error.
+        apart: clusters that were one but do not move together, with that one's index.
+    """
+
+    def __init__(self, looks: tuple[StateLook, StateLook], config: SearchConfig, seed: int):
+        self.looks = looks
+        self.config = config
+        self.generator = np.random.default_rng(seed)
+        self.voxel = looks[0].hull.voxel
+        self.views = [np.array(spread_cameras(look.stack.cameras, config.looks)) for look in looks]
+        found = clusters(looks, config.cue)
+        still = self._still_points(found)
+        self.base_box, self.still = self.box(still), KDTree(still)
+        moving = [[cluster.points for cluster in found if cluster.state == state] for state in (0, 1)]
+        self.moving = [KDTree(np.concatenate([np.zeros((0, 3)), *points])) for points in moving]
+        self.clusters: list[Cluster] = []
+        self.boxes: list[Box] = []
+        self.held: list[Bool[Tensor, " N"]] = []
+        self.weights: list[float] = []
+        self.apart: dict[int, int] = {}
+        for cluster in found[: 2 * config.most]:
+            if len(self.clusters) < config.most:
+                self.take(cluster)
+
+    def __len__(self) -> int:
+        return len(self.clusters)
+
+    def _still_points(self, found: list[Cluster]) -> Float64[np.ndarray, "P 3"]:
+        """Points of either state that none of these clusters holds; all points of state 0 where they hold everything."""
+        rows = []
+        for state, look in enumerate(self.looks):
+            still = np.ones(len(look.points), bool)
+            for cluster in found:
+                if cluster.state == state:
+                    still &= ~self.box(cluster.points).contains(torch.from_numpy(look.points), margin=self.voxel).numpy()
+            rows.append(look.points[still])
+        return max(rows, key=len) if any(map(len, rows)) else self.looks[0].points
+
+    def take(self, cluster: Cluster) -> None:
+        """Takes a cluster among those to explain, if the photos of its own state need it where they show it."""
+        held = self.held_by(cluster.points, cluster.state)
+        weight, footprint = self.weigh(held, cluster.state)
+        if weight > self.config.there * footprint:
+            self.clusters.append(cluster)
+            self.boxes.append(self.box(cluster.points))
+            self.held.append(held)
+            self.weights.append(weight)
+
+    def weigh(self, held: Bool[Tensor, " N"], state: int) -> tuple[float, float]:
+        """What a state's photos lose without some of its splats, in mean error, and the share of them that shows these."""
+        splats = self.looks[state].splats
+        scene, piece = self.scene(state, splats[~held]), splats[held]
+        return scene.absent - scene.error(piece, SE3.identity(dtype=torch.float64)), scene.footprint(piece)
+
+    def box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
+        """The box around points."""
+        return box_around(points, thinnest=0.5 * self.voxel)
+
+    def held_by(self, points: Float64[np.ndarray, "P 3"], state: int) -> Bool[Tensor, " N"]:
+        """Which splats of a state lie in the box of points or near it, and no nearer to what else moved."""
+        means = self.looks[state].splats.means.double()
+        held = self.box(points).contains(means, margin=self.config.clear * self.voxel)
+        inside = means[held].numpy()
+        held[held.clone()] = torch.from_numpy(
+            KDTree(points).query(inside)[0] < self.moving[state].query(inside)[0] + 0.5 * self.voxel
+        )
+        return held
+
+    def splats_of(self, part: MovingPart) -> Splats:
+        """A part's splats in its own state: its pieces', as one box around all may hold some of the base."""
+        held = [self.held_by(points, part.state) for points in part.pieces]
+        return self.looks[part.state].splats[torch.stack(held).any(0)]
+
+    def splats_in(self, members: set[int]) -> Splats:
+        """The splats of the clusters in `members`, all of one state."""
+        splats = self.looks[self.clusters[min(members)].state].splats
+        return splats[torch.stack([self.held[i] for i in sorted(members)]).any(0)]
+
+    def scene(self, state: int, rest: Splats) -> Scene:
+        """A state's photos as judges of a part among all the rest."""
+        return Scene(self.looks[state], rest, self.views[state], self.still)
+
+    def rest(self, parts: list[MovingPart], state: int) -> Splats:
+        """All that stands still in `state`, with the parts found so far as they stand in the other state."""
+        splats = self.looks[state].splats
+        moving = torch.zeros(len(splats), dtype=torch.bool)
+        for cluster, held in zip(self.clusters, self.held, strict=True):
+            if cluster.state == state:
+                moving |= held
+        placed = []
+        for part in parts:
+            piece = self.splats_of(part)
+            placed.append(piece.moved(part.hypothesis.motion) if part.state == state else piece)
+        return Splats.concatenate([splats[~moving], *placed])
+
+    def trial(self, state: int, points: Points, piece: Splats, weight: float, others: list[MovingPart]) -> Trial:
+        """What was found in a state between the photos of both, with the other parts in place."""
+        return Trial(
+            there=self.scene(1 - state, self.rest(others, state)),
+            here=self.scene(state, self.rest(others, 1 - state)),
+            others=self.looks[1 - state].splats,
+            piece=piece,
+            box=self.box(points),
+            weight=weight,
+            most=weight,
+            near=self.voxel,
+        )
+
+    def pulled(self, start: Hypothesis, trial: Trial, steps: int) -> Hypothesis:
+        """The simplest motion that does where the photos pull a hypothesis, or the hypothesis, if all in all it is better."""
+        start = trial.judge(start)
+        refined = refine(start, trial, steps, self.config.rate)
+        return min(simplest(refined, trial, self.base_box, self.config.plain), start, key=trial.cost)
+
+    def sample(self, points: Float64[np.ndarray, "P 3"], most: int) -> Float64[np.ndarray, "Q 3"]:
+        """At most so many of the points, drawn by chance."""
+        return points if len(points) <= most else points[self.generator.choice(len(points), most, replace=False)]
