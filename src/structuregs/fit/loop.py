@@ -192,6 +192,10 @@ class Fitter:
             error, renders, psnr = self._image_loss(parts)
             loss = loss + error
         loss.backward()
+        if config.hypotheses:  # the base's box is known, and is no smaller for being hollow, as that of a table with its legs
+            for name in _BOX_NAMES:
+                if (gradient := variables.leaves[name].grad) is not None:
+                    gradient[0] = 0
         for render_, size in renders:
             self.state.gradients.add(render_.projection, size)
         self._adam()
