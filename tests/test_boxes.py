@@ -588,6 +588,17 @@ class TestBoxesOfParts:
         still = torch.cat([item.box.corners for item in obj.parts[0].boxes]).float()
         assert boxes[0].contains(still, margin=2 * voxel).all()
 
+    def test_what_few_masks_leave_in_the_air_is_not_the_base_s(self):
+        _, looks = looks_of("laptop")
+        clean = boxes_of_parts(looks, parts_of("laptop"), SMALL)[0]
+        haunted = []
+        for look in looks:
+            occupied = look.hull.occupied.copy()
+            occupied[:6, :6, -6:] = True  # a corner of the grid, far from the laptop
+            haunted.append(replace(look, hull=replace(look.hull, occupied=occupied)))
+        found = boxes_of_parts((haunted[0], haunted[1]), parts_of("laptop"), SMALL)[0]
+        torch.testing.assert_close(found.half_extents, clean.half_extents)
+
     def test_at_rest_nothing_moves_yet(self):
         obj, looks = looks_of("laptop")
         boxes, motions = boxes_at_rest(looks, 1, SMALL)

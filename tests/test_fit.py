@@ -278,6 +278,14 @@ class TestOptimiser:
             torch.testing.assert_close(first, reference.state[mirror[name]]["exp_avg"])
             torch.testing.assert_close(second, reference.state[mirror[name]]["exp_avg_sq"])
 
+    @pytest.mark.parametrize("hypotheses", [True, False])
+    def test_the_base_s_box_moves_only_where_no_search_has_found_it(self, hypotheses: bool):
+        fit = fitter(replace(QUICK, hypotheses=hypotheses))
+        before = fit.state.variables.parts().boxes.half_extents.detach().clone()
+        list(fit.run(QUICK.structure_until))
+        moved = (fit.state.variables.parts().boxes.half_extents.detach() - before).abs().amax(1) > 1e-6
+        assert moved.tolist() == [not hypotheses, True, True]
+
     def test_a_motion_goes_where_its_gradient_points(self):
         """Of a direction that the photos hardly see, Adam would make as much as of the others."""
         fit = fitter(replace(PLAIN, steps=1000, structure_until=1000))

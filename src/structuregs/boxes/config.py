@@ -22,8 +22,8 @@ class SearchConfig:
     """A part that explains less than this share of its weight, of the 2 that it could of both states' photos, waits until the
     other state's clusters have been tried: it may be several."""
     shows: float = 0.1
-    """What takes less than this share of a cluster's weight off the error of the other state's photos was shut there: whether
-    it is several parts is told by their fronts."""
+    """What takes less than this share of a cluster's weight off the error of the other state's photos was shut there, and is
+    told by its front; where it is several parts, by theirs."""
     hopeless: float = 0.3
     """Another way for a part to lie is not pulled into place if it costs this share of the part's weight more."""
     thinner: float = 0.7
@@ -46,7 +46,9 @@ class SearchConfig:
     rate: float = 0.03
     """Of a finalist's pose: radians, and parts of the box's half diagonal."""
     plain: float = 0.1
-    """The simplest motion near a finalist is taken if that costs less than this share of what the part explains."""
+    """The simplest motion near a finalist is taken if that costs less than this share of what the part explains..."""
+    plain_if_shut: float = 0.25
+    """...or this, of what was shut: its front was brought back without the sides that the photos show, and is drawn aside."""
     same: float = 0.15
     """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
     alike: float = 0.12

@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+import skimage.measure
 import torch
 import trimesh
 from jaxtyping import Bool, Float64
 from scipy.spatial import KDTree
 from sklearn.cluster import DBSCAN
+from torch import Tensor
 
 from ..capture import ImageStack
 from ..geometry import Box
@@ -126,14 +128,39 @@ def split_where_hollow(points: Float64[np.ndarray, "P 3"], thinnest: float, rati
     return [piece for side in (low, ~low) for piece in split_where_hollow(points[side], thinnest, ratio)]
 
 
-def box_around(points: Float64[np.ndarray, "P 3"], thinnest: float, trim: float = 0.002) -> Box:
+def box_around(
+    points: Float64[np.ndarray, "P 3"], thinnest: float, trim: float = 0.002, axes: Float64[Tensor, "3 3"] | None = None
+) -> Box:
     """The oriented box of least volume around points, the outermost fraction `trim` left out along each axis.
 
     Args:
         points: in the world.
         thinnest: smallest half extent to give, world units (points on a plane have no thickness).
         trim: fraction of the points that may stick out at each face.
+        axes: of the box, as columns, if it is not free to turn.
     """
+    axes = _tight_axes(points) if axes is None else axes
+    local = points @ axes.numpy()
+    low, high = np.quantile(local, [trim, 1 - trim], axis=0)
+    box = Box.around(torch.from_numpy(np.stack([low, high]) @ axes.numpy().T), axes)
+    return Box(box.T_world_box, box.half_extents.clamp(min=thinnest))
+
+
+def base_axes(looks: tuple[StateLook, StateLook]) -> Float64[Tensor, "3 3"]:
+    """Axes, as columns, of what stands still: of the box around the largest solid that both hulls hold.
+
+    Points of a quick look at few photos stray too far from the surface to say how the whole lies.
+    """
+    hull = looks[0].hull
+    both = hull.occupied & looks[1].hull.occupied
+    if not both.any():
+        return _tight_axes(looks[0].points)
+    solids = np.asarray(skimage.measure.label(both, connectivity=1))
+    return _tight_axes(hull.centres(solids == np.bincount(solids[both]).argmax()))
+
+
+def _tight_axes(points: Float64[np.ndarray, "P 3"]) -> Float64[Tensor, "3 3"]:
+    """Axes, as columns, of the box of least volume that holds all points."""
     try:
         to_box = trimesh.bounds.oriented_bounds(points)[0]
         axes = torch.from_numpy(to_box[:3, :3].T.copy())
@@ -141,7 +168,4 @@ def box_around(points: Float64[np.ndarray, "P 3"], thinnest: float, trim: float 
         axes = torch.from_numpy(np.linalg.svd(points - points.mean(0), full_matrices=True)[2].T.copy())
     if torch.linalg.det(axes) < 0:
         axes[:, 0] *= -1
-    local = points @ axes.numpy()
-    low, high = np.quantile(local, [trim, 1 - trim], axis=0)
-    box = Box.around(torch.from_numpy(np.stack([low, high]) @ axes.numpy().T), axes)
-    return Box(box.T_world_box, box.half_extents.clamp(min=thinnest))
+    return axes

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..geometry import SE3, Box, screw_at
+from ..geometry import SE3, Box, Screw, screw_at
 from ..joints import kind_of
 from ..model import SH_C0, Splats
 from ..raster import Render, image_loss, painted_share, render
@@ -207,7 +207,7 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
 
     A few photos of a small part hardly tell a slide from a slide with a little turn, or one along the box from one a little
     askew; joints are built along boxes, and they turn or slide.  Tried in turn: the slide and the turn along an axis of
-    the base or the box, the slide, the turn.
+    the base or the box, whichever is better, the slide, the turn.
 
     Args:
         hypothesis: a motion with its errors.
@@ -219,18 +219,19 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
     motion, centre = hypothesis.motion, box.T_world_box.xyz
     slide, length = screw_at(motion, "prismatic", centre)
     turn, angle = screw_at(motion, "revolute", centre)
-    candidates = [(slide, length), (turn, angle)]
-    for screw, q in ((turn, angle), (slide, length)):
-        for axes in (box.T_world_box.rotation.T, base.T_world_box.rotation.T):
+    ways: list[list[tuple[Screw, float]]] = [[], [], [(slide, length)], [(turn, angle)]]
+    for way, (screw, q) in zip(ways, ((slide, length), (turn, angle)), strict=False):
+        for axes in (base.T_world_box.rotation.T, box.T_world_box.rotation.T):
             along = axes @ screw.axis
             nearest = int(along.abs().argmax())
             if abs(float(along[nearest])) > np.cos(np.deg2rad(20)):
-                candidates.insert(0, (replace(screw, axis=axes[nearest]), q * float(along[nearest])))
+                way.append((replace(screw, axis=axes[nearest]), q * float(along[nearest])))
     enough = hypothesis.error + share * max(trial.absent - hypothesis.error, 0.0) + NOISE * trial.absent
-    for screw, q in candidates:
-        judged = trial.judge(trial.moved(hypothesis, screw.motion(q)))
-        if judged.error < enough:
-            return judged
+    for way in ways:
+        judged = [trial.judge(trial.moved(hypothesis, screw.motion(q))) for screw, q in way]
+        best = min(judged, key=lambda h: h.error, default=None)
+        if best is not None and best.error < enough:
+            return best
     return hypothesis
 
 

@@ -43,7 +43,7 @@ class PartSearch:
         config, box = self.config, trial.box
         screw, q = screw_at(part.hypothesis.motion, kind_of(part.hypothesis.motion), box.T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
-        if trial.there.absent - part.hypothesis.image_error > config.shows * part.weight:
+        if self.pieces.shows(trial, part.hypothesis):
             support = trial.there.support(trial.piece, motions)
             least = config.divided * part.weight * trial.there.pixels
             means = trial.piece.means.double().numpy()

@@ -12,7 +12,7 @@ from ..capture import spread_cameras
 from ..geometry import SE3, Box
 from ..model import Splats
 from .config import SearchConfig
-from .cue import Cluster, Points, StateLook, box_around, clusters
+from .cue import Cluster, Points, StateLook, base_axes, box_around, clusters
 from .hypotheses import Hypothesis
 from .judge import Scene, Trial, refine, simplest
 
@@ -79,7 +79,8 @@ class Pieces:
         self.views = [np.array(spread_cameras(look.stack.cameras, config.looks)) for look in looks]
         found = clusters(looks, config.cue)
         still = self._still_points(found)
-        self.base_box, self.still = self.box(still), KDTree(still)
+        self.base_box = box_around(still, thinnest=0.5 * self.voxel, axes=base_axes(looks))
+        self.still = KDTree(still)
         moving = [[cluster.points for cluster in found if cluster.state == state] for state in (0, 1)]
         self.moving = [KDTree(np.concatenate([np.zeros((0, 3)), *points])) for points in moving]
         self.clusters: list[Cluster] = []
@@ -179,7 +180,12 @@ class Pieces:
         """The simplest motion that does where the photos pull a hypothesis, or the hypothesis, if all in all it is better."""
         start = trial.judge(start)
         refined = refine(start, trial, steps, self.config.rate)
-        return min(simplest(refined, trial, self.base_box, self.config.plain), start, key=trial.cost)
+        share = self.config.plain if self.shows(trial, refined) else self.config.plain_if_shut
+        return min(simplest(refined, trial, self.base_box, share), start, key=trial.cost)
+
+    def shows(self, trial: Trial, hypothesis: Hypothesis) -> bool:
+        """Whether the photos of the other state show more than the front of what was tried."""
+        return trial.there.absent - hypothesis.image_error > self.config.shows * trial.weight
 
     def sample(self, points: Float64[np.ndarray, "P 3"], most: int) -> Float64[np.ndarray, "Q 3"]:
         """At most so many of the points, drawn by chance."""

@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from jaxtyping import Float64
+from torch import Tensor
 
 from ..capture import Capture, stack_views
 from ..geometry import SE3, Box
 from ..points import Clouds, Silhouettes, object_bounds
 from .appearance import AppearanceConfig, fit_state, surface_points
 from .config import SearchConfig
-from .cue import StateLook, box_around, clusters
+from .cue import StateLook, base_axes, box_around, clusters
 from .partition import PartSearch
 from .pieces import MovingPart
 
@@ -59,8 +60,8 @@ def survey(capture: Capture, given: Clouds | None, config: StartConfig, seed: in
     return first, second
 
 
-def _grown(points: Float64[np.ndarray, "P 3"], by: float) -> Box:
-    box = box_around(points, thinnest=0.5 * by)
+def _grown(points: Float64[np.ndarray, "P 3"], by: float, axes: Float64[Tensor, "3 3"] | None = None) -> Box:
+    box = box_around(points, thinnest=0.5 * by, axes=axes)
     return Box(box.T_world_box, box.half_extents + by)
 
 
@@ -69,7 +70,7 @@ def boxes_of_parts(looks: tuple[StateLook, StateLook], parts: list[MovingPart], 
     by = config.margin * looks[0].hull.voxel
     moving = [_grown(part.points_in(0), by) for part in parts]
     posed = [(box, box.moved(part.motion)) for box, part in zip(moving, parts, strict=True)]
-    still = _grown(_still_points(looks, posed), by)
+    still = _grown(_still_points(looks, posed), by, base_axes(looks))
     return _stacked([still, *moving], [SE3.identity(dtype=torch.float64), *(part.motion for part in parts)])
 
 
@@ -104,7 +105,7 @@ def boxes_at_rest(looks: tuple[StateLook, StateLook], count: int | None, config:
     found = clusters(looks, config.search.cue)
     chosen = [c for c in found if c.state == 0] or found
     moving = [_grown(c.points, by) for c in chosen[:count]]
-    boxes = [_grown(_still_points(looks, [(box, box) for box in moving]), by), *moving]
+    boxes = [_grown(_still_points(looks, [(box, box) for box in moving]), by, base_axes(looks)), *moving]
     return _stacked(boxes, [SE3.identity(dtype=torch.float64)] * len(boxes))
 
 
