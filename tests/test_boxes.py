@@ -546,7 +546,7 @@ class TestCutFronts:
         torch.tensor([2.0, 0.3, 0.1], dtype=F64),
     )
 
-    def pieces(self, factors: tuple[float, float, float], kind: str = "prismatic") -> list[np.ndarray]:
+    def pieces(self, factors: tuple[float, float, float], kind: str = "prismatic", voxel: float = 0.02) -> list[np.ndarray]:
         generator = np.random.default_rng(0)
         points = generator.uniform(-1, 1, (2000, 3)) * self.BOX.half_extents.numpy()
         fronts = generator.uniform(-1, 1, (600, 3))
@@ -557,7 +557,7 @@ class TestCutFronts:
             (len(tried), 600)
         )
         along = Screw(kind, torch.tensor([0.0, 1, 0], dtype=F64), torch.zeros(3, dtype=F64))  # pyright: ignore[reportArgumentType]
-        return cut_fronts(points, self.BOX, fronts, support, along)
+        return cut_fronts(points, self.BOX, fronts, support, along, voxel)
 
     def test_drawers_that_come_out_differently_are_cut_where_they_meet(self):
         pieces = sorted(self.pieces((0.6, 1.0, 0.8)), key=lambda piece: piece[:, 0].mean())
@@ -568,6 +568,10 @@ class TestCutFronts:
     def test_one_that_comes_out_as_a_whole_is_left_whole(self):
         (piece,) = self.pieces((1.0, 1.0, 1.0))
         assert len(piece) == 2000
+
+    def test_nothing_is_cut_that_is_hardly_wider_than_the_clusters_are_sharp(self):
+        assert len(self.pieces((0.6, 1.0, 0.8), voxel=0.4)) == 3
+        assert len(self.pieces((0.6, 1.0, 0.8), voxel=0.6)) == 1
 
     def test_nothing_is_cut_where_the_motion_carries_it(self):
         (piece,) = self.pieces((0.6, 1.0, 0.8), kind="revolute")

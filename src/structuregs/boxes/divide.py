@@ -18,6 +18,7 @@ FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
 _TOGETHER = 1.13  # what is cut must explain so many times what it does as one...
 _BETTER = 1.04  # ...every cut so many times what it did before, ...
 _EACH = 0.08  # ...and every piece this share of what all do as one, and of the points
+_NARROWEST = 4  # voxels: no part beside another is narrower
 _POOL = 24  # neighbours over which a splat's support is averaged
 _VOTERS = 12  # splats around a point that say what it belongs to
 
@@ -79,7 +80,12 @@ def vote(
 
 
 def cut_fronts(
-    points: Points, box: Box, fronts: Float64[np.ndarray, "N 3"], support: Float64[np.ndarray, "F N"], screw: Screw
+    points: Points,
+    box: Box,
+    fronts: Float64[np.ndarray, "N 3"],
+    support: Float64[np.ndarray, "F N"],
+    screw: Screw,
+    voxel: float,
 ) -> list[Points]:
     """The points of one cluster, cut where pieces of it would rather be pulled out by lengths of their own.
 
@@ -91,10 +97,12 @@ def cut_fronts(
         fronts: what shows in the other state where the cluster was, as it lies in the box's canonical space.
         support: of each splat there for each of the factors, brought back (see `Scene.support`).
         screw: along which the cluster moves as a whole.
+        voxel: of the hull, world units.
     """
     towards = (box.T_world_box.rotation.T @ screw.axis).abs()
     unmoved = towards < 0.2 if screw.kind == "prismatic" else towards > 0.98
-    axes = [int(axis) for axis in torch.nonzero(unmoved).flatten()]
+    wide = box.half_extents > _NARROWEST * voxel  # room for two
+    axes = [int(axis) for axis in torch.nonzero(unmoved & wide).flatten()]
     common = float(support.sum(1).max())
     local = box.to_canonical(torch.from_numpy(points)).numpy()
     pieces = _cut(fronts, support, local, axes, (_EACH * common, _EACH * len(local)))

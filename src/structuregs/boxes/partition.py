@@ -39,7 +39,10 @@ class PartSearch:
         self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
 
     def _divided(self, part: MovingPart, trial: Trial, known_cut: bool) -> list[Points]:
-        """The points of a part as those of several, if it turns out to be several parts; else all of them."""
+        """The points of a part as those of several, if it turns out to be several parts; else all of them.
+
+        What shows in the other state says it splat by splat; what was shut there by its fronts, unless it was cut before.
+        """
         config, box = self.config, trial.box
         screw, q = screw_at(part.hypothesis.motion, kind_of(part.hypothesis.motion), box.T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
@@ -50,11 +53,13 @@ class PartSearch:
             return divide(part.points, means, support, config.mixed, least, config.cue, self.pieces.voxel)
         if known_cut:
             return [part.points]
-        nears = [replace(trial, near=0.0).lies(motions[f]) for f in range(len(FACTORS))]
-        fronts = trial.others[torch.stack(nears).any(0)]
+        means = trial.others.means.double()
+        fronts = trial.others[torch.stack([box.moved(motions[f]).contains(means) for f in range(len(FACTORS))]).any(0)]
         there = box.moved(part.hypothesis.motion)
         support = trial.here.support(fronts, motions.inverse())
-        return cut_fronts(part.points, box, there.to_canonical(fronts.means.double()).numpy(), support, screw)
+        return cut_fronts(
+            part.points, box, there.to_canonical(fronts.means.double()).numpy(), support, screw, self.pieces.voxel
+        )
 
     def _replaced(self, index: int, points: list[Points]) -> list[int]:
         """Indices of new clusters in place of one; these do not move together."""
