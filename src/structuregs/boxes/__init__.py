@@ -4,7 +4,7 @@ from .config import SearchConfig
 from .cue import Cluster, CueConfig, StateLook, box_around, clusters
 from .fill import seeded, strewn
 from .partition import PartSearch
-from .pieces import MovingPart, Pieces
+from .pieces import MovingPart
 from .survey import StartConfig, boxes_at_rest, boxes_of_parts, find_parts, look_at_states, survey
 
 __all__ = [
@@ -12,7 +12,6 @@ __all__ = [
     "CueConfig",
     "MovingPart",
     "PartSearch",
-    "Pieces",
     "SearchConfig",
     "StartConfig",
     "StateLook",
