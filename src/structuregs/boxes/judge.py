@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from scipy.optimize import minimize_scalar
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -132,13 +132,9 @@ class Trial:
         """Error of the photos of both states without the part."""
         return self.there.absent + self.here.absent
 
-    def lies(self, motion: SE3) -> Bool[Tensor, " N"]:
-        """Which splats of the other state lie where a motion takes the part."""
-        return self.box.moved(motion).contains(self.others.means.double(), margin=self.near)
-
     def brought(self, motion: SE3) -> Splats:
-        """These splats, in the other state."""
-        return self.others[self.lies(motion)]
+        """What lies in the other state where a motion takes the part; still there."""
+        return self.others[self.box.moved(motion).contains(self.others.means.double(), margin=self.near)]
 
     def judge(self, hypothesis: Hypothesis, quick: bool = False) -> Hypothesis:
         """The hypothesis with its errors."""
