@@ -48,14 +48,14 @@ def divide(
         voxel: of the hull, world units.
     """
     common = float(support.sum(1).max())
-    local = pooled(means, support)
+    local = _pooled(means, support)
     own = np.maximum(local.max(0), 0.0)
     if common <= 0 or own.sum() < max(mixed * common, common + least):
         return [points]
     best = local.argmax(0)
     strength = np.bincount(best, own, minlength=len(support))
     mode = int(np.convolve(strength, np.ones(3), "same").argmax())
-    agrees = vote(points, means, (np.abs(best - mode) <= 1) & (own > 0), own)
+    agrees = _vote(points, means, (np.abs(best - mode) <= 1) & (own > 0), own)
     cores = linked(points[agrees], cue, voxel)
     if not cores:
         return [points]
@@ -66,12 +66,12 @@ def divide(
     return [points[nearest == k] for k in range(len(pieces))]
 
 
-def pooled(means: Points, support: Float64[np.ndarray, "F N"]) -> Float64[np.ndarray, "F N"]:
+def _pooled(means: Points, support: Float64[np.ndarray, "F N"]) -> Float64[np.ndarray, "F N"]:
     """The mean support of each splat and its neighbours."""
     return support[:, KDTree(means).query(means, k=min(_POOL, len(means)))[1]].mean(2)
 
 
-def vote(
+def _vote(
     points: Points, means: Points, yes: Bool[np.ndarray, " N"], weight: Float64[np.ndarray, " N"]
 ) -> Bool[np.ndarray, " P"]:
     """Which points have about them more weight of splats that say yes than of others."""

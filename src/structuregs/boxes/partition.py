@@ -167,11 +167,11 @@ class PartSearch:
             trial = self._again(part, others)
             shared = [p.motion if part.state == 0 else p.motion.inverse() for p in others]
             own = part.hypothesis
-            starts = [own, *part.rivals[:2], *(trial.moved(own, T) for T in shared)]
+            as_they_move = [trial.judge(trial.moved(own, T)) for T in shared]
+            starts = [*(trial.judge(h) for h in (own, *part.rivals[:2])), *as_they_move]
             again = [self.pieces.pulled(h, trial, self.config.steps) for h in starts]
             by_cost = sorted(again, key=trial.cost)
             gaps = displacements(stack_motions(shared), by_cost[0].motion, trial.box)
-            as_they_move = [trial.judge(trial.moved(own, T)) for T in shared]
             losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
@@ -222,8 +222,8 @@ class PartSearch:
             trial = self._again(part, parts[:index] + parts[index + 1 :])
             own = part.hypothesis
             ways = [own, *part.rivals[:1], *(trial.moved(own, T) for T in flips(own.motion, trial.box))]
-            costs = [trial.cost(trial.judge(h)) for h in ways]
-            hopeful = [h for h, cost in zip(ways, costs, strict=True) if cost < costs[0] + self.config.hopeless * part.weight]
+            judged = [trial.judge(h) for h in ways]
+            hopeful = [h for h in judged if trial.cost(h) < trial.cost(judged[0]) + self.config.hopeless * part.weight]
             again = [self.pieces.pulled(h, trial, 2 * self.config.steps) for h in hopeful]
             parts[index] = replace(part, hypothesis=measured(min(again, key=trial.cost), trial))
         return parts
@@ -306,7 +306,7 @@ class PartSearch:
         for row in finalists(motions, [cost for _, _, cost in judged], box, self.config.finalists):
             start, group, _ = judged[row]
             trial = self._with(alone, index, group)
-            pulled = pieces.pulled(start, trial, self.config.steps)
+            pulled = pieces.pulled(trial.judge(start), trial, self.config.steps)
             refined.append((pulled, group, trial.cost(pulled)))
         refined.sort(key=lambda row: row[2])
         chosen = distinct(stack_motions([h.motion for h, _, _ in refined]), box, 0.1, len(refined))

@@ -108,19 +108,15 @@ class Pieces:
 
     def take(self, cluster: Cluster) -> None:
         """Takes a cluster among those to explain, if the photos of its own state need it where they show it."""
+        splats = self.looks[cluster.state].splats
         held = self.held_by(cluster.points, cluster.state)
-        weight, footprint = self.weigh(held, cluster.state)
-        if weight > self.config.there * footprint:
+        scene, piece = self.scene(cluster.state, splats[~held]), splats[held]
+        weight = scene.absent - scene.error(piece, SE3.identity(dtype=torch.float64))
+        if weight > self.config.there * scene.footprint(piece):
             self.clusters.append(cluster)
             self.boxes.append(self.box(cluster.points))
             self.held.append(held)
             self.weights.append(weight)
-
-    def weigh(self, held: Bool[Tensor, " N"], state: int) -> tuple[float, float]:
-        """What a state's photos lose without some of its splats, in mean error, and the share of them that shows these."""
-        splats = self.looks[state].splats
-        scene, piece = self.scene(state, splats[~held]), splats[held]
-        return scene.absent - scene.error(piece, SE3.identity(dtype=torch.float64)), scene.footprint(piece)
 
     def box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
         """The box around points."""
@@ -177,8 +173,13 @@ class Pieces:
         )
 
     def pulled(self, start: Hypothesis, trial: Trial, steps: int) -> Hypothesis:
-        """The simplest motion that does where the photos pull a hypothesis, or the hypothesis, if all in all it is better."""
-        start = trial.judge(start)
+        """The simplest motion that does where the photos pull a hypothesis, or the hypothesis, if all in all it is better.
+
+        Args:
+            start: the hypothesis, with its errors.
+            trial: the part between the photos.
+            steps: of the pull.
+        """
         refined = refine(start, trial, steps, self.config.rate)
         share = self.config.plain if self.shows(trial, refined) else self.config.plain_if_shut
         return min(simplest(refined, trial, self.base_box, share), start, key=trial.cost)
