@@ -286,7 +286,7 @@ def trial_of_screen() -> Trial:
     there, here = (
         Scene(looks[s], looks[1 - s].splats[~inside[1 - s]], np.arange(0, 16, 2), KDTree(looks[s].points)) for s in (1, 0)
     )
-    return Trial(there, here, looks[1].splats, looks[0].splats[inside[0]], screen, weight=0.1, most=0.1, near=0.0)
+    return Trial(there, here, looks[1].splats, looks[0].splats[inside[0]], screen, weight=0.1, most=0.1, near=0.0, least=0.01)
 
 
 def distance_to_surface(points: np.ndarray, obj: KnownObject, state: int) -> Tensor:
@@ -470,6 +470,16 @@ class TestParts:
         assert trial.cost(fair) == pytest.approx(-0.035)
         assert trial.cost(greedy) == pytest.approx(-0.03)
         assert greedy.error < fair.error
+
+    def test_a_turn_speaks_the_less_for_itself_the_less_the_other_state_shows_of_it(self):
+        trial = replace(trial_of_screen(), weight=0.02, most=0.02)
+        (true,) = looks_of("laptop")[0].joints
+        slide = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0.1, 0.0, 0.0], dtype=F64))
+        for shown, against in ((-0.01, 0.006), (0.0, 0.006), (0.002, 0.004), (0.006, 0.0), (0.02, 0.0)):
+            turned, slid = (Hypothesis(T, 0.0, 0.0, 0.0, trial.there.absent - shown, 0.1) for T in (true.motion(), slide))
+            assert trial.gone_in(turned) == pytest.approx(against, abs=1e-9)
+            assert trial.gone_in(slid) == 0
+            assert trial.cost(turned) - trial.cost(slid) == pytest.approx(against, abs=1e-9)
 
     def test_what_a_splat_takes_off_the_error_adds_up_to_what_the_part_does(self):
         obj, looks = looks_of("laptop")

@@ -11,7 +11,7 @@ from door_and_drawer import DOOR, DRAWER, made_of, photographed
 from structuregs.capture import stack_views
 from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
-from structuregs.fit.loop import FitState, Fitter
+from structuregs.fit.loop import FitState, Fitter, askew
 from structuregs.fit.merge import idle_part, moving_alike
 from structuregs.fit.reconstruct import RunFolder, choose_device, finished_object, tightened
 from structuregs.fit.schedule import PRESETS, FitConfig, Growth, Rates
@@ -404,6 +404,41 @@ class TestCheckpoint:
         torch.save(record, tmp_path / "last.pt")
         with pytest.raises(ValueError, match=r"last\.pt: the checkpoint is damaged"):
             FitState.load(tmp_path / "last.pt")
+
+
+def sliding(way: Tensor) -> PosedParts:
+    """The door and the drawer in a turned base, the drawer sliding along a direction of the base's box."""
+    parts = turned_parts()
+    motions = parts.motions.wxyz_xyz.clone()
+    motions[2] = SE3.from_quat(SE3.identity().wxyz, parts.boxes.T_world_box.rotation[0] @ way).wxyz_xyz
+    return replace(parts, motions=SE3(motions.requires_grad_()))
+
+
+class TestAskew:
+    @pytest.mark.parametrize("degrees", [0.0, 3.0, 8.0])
+    def test_is_the_squared_sine_of_the_angle_to_the_nearest_axis(self, degrees: float):
+        angle = math.radians(degrees)
+        parts = sliding(0.3 * torch.tensor([0.0, -math.cos(angle), math.sin(angle)]))
+        assert float(askew(parts, ["revolute", "prismatic"]).detach()) == pytest.approx(math.sin(angle) ** 2, abs=1e-6)
+        assert float(askew(parts, ["revolute", "revolute"])) == 0
+
+    @pytest.mark.parametrize("way", [(0.2, 0.1, 0.0), (0.0, 0.0, 0.0), (1e-5, 1e-7, 0.0)])
+    def test_does_not_draw_what_is_far_from_an_axis_or_stands_still(self, way: tuple[float, float, float]):
+        parts = sliding(torch.tensor(way))
+        askew(parts, ["revolute", "prismatic"]).backward()
+        assert parts.motions.wxyz_xyz.grad is not None
+        assert float(parts.motions.wxyz_xyz.grad.abs().max()) == 0
+
+    def test_draws_a_slide_from_the_first_step_with_an_image(self):
+        angle = math.radians(3)
+        true = DRAWER.motion()
+        skew = SE3.exp(torch.tensor([0.0, 0, 0, 0, 0, angle])).rotation @ true.xyz.float()
+        parts = made_of(DOOR.motion(), SE3.from_quat(SE3.identity().wxyz, skew)).parts
+        blind = replace(QUICK, image_weight=1e-9, one_joint_from=1.0, steps=40, slide_along_base=1.0, join_at=1.0)
+        fit = Fitter(photographed(made_of(DOOR.motion(), true)), blind, FitState.start(parts), 0, torch.device("cpu"))
+        before = float(askew(parts, ["revolute", "prismatic"]))
+        list(fit.run(40))
+        assert float(askew(fit.state.variables.parts().detach(), ["revolute", "prismatic"])) < 0.2 * before
 
 
 def two_pieces(gap: float, **second: float) -> PosedParts:

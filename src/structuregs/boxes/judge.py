@@ -19,6 +19,7 @@ from .hypotheses import Hypothesis, oddity, turn_about
 
 _ALPHA_WEIGHT = 0.5  # of the mask's error beside the colour's
 _FEW = 4  # photos of either state that do for a quick look
+_SHOWN_SHUT = 0.3  # of a part's weight: so much the photos of a state in which a door or lid is shut lose without it
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
 
@@ -116,6 +117,7 @@ class Trial:
         weight: what the photos of the part's own state would lose without it, in mean error.
         most: what it can explain of either: its weight, with that of what moves along.
         near: how far from the moved box splats count as lying there, world units.
+        least: a part shows in the other state if it takes this much off the error of its photos.
     """
 
     there: Scene
@@ -126,6 +128,7 @@ class Trial:
     weight: float
     most: float
     near: float
+    least: float
 
     @property
     def absent(self) -> float:
@@ -154,9 +157,23 @@ class Trial:
         without = [scene.absent_quick if quick else scene.absent for scene in (self.there, self.here)]
         return sum(min(a - b, self.most) for a, b in zip(without, (hypothesis.image_error, hypothesis.back_error), strict=True))
 
+    def shows(self, hypothesis: Hypothesis) -> bool:
+        """Whether the photos of the other state show more than the front of the part where a judged hypothesis takes it."""
+        return self.there.absent - hypothesis.image_error > self.least
+
+    def gone_in(self, hypothesis: Hypothesis, quick: bool = False) -> float:
+        """What speaks against a judged turn after which little shows of the part, in mean error.
+
+        What the other state does not show has gone in somewhere: drawers and trays do, but a door that is shut shows itself.
+        """
+        if kind_of(hypothesis.motion) == "prismatic":
+            return 0.0
+        shown = (self.there.absent_quick if quick else self.there.absent) - hypothesis.image_error
+        return float(np.clip(_SHOWN_SHUT * self.weight - shown, 0, _SHOWN_SHUT * self.weight))
+
     def cost(self, hypothesis: Hypothesis, quick: bool = False) -> float:
         """What hypotheses are compared by: what speaks against them, less what they explain."""
-        return hypothesis.against(self.weight) - self.explained(hypothesis, quick)
+        return hypothesis.against(self.weight) + self.gone_in(hypothesis, quick) - self.explained(hypothesis, quick)
 
     def gain(self, hypothesis: Hypothesis) -> float:
         """Fraction that the part takes off the error of both states' photos."""
@@ -220,8 +237,7 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
         for axes in (base.T_world_box.rotation.T, box.T_world_box.rotation.T):
             along = axes @ screw.axis
             nearest = int(along.abs().argmax())
-            if abs(float(along[nearest])) > np.cos(np.deg2rad(20)):
-                way.append((replace(screw, axis=axes[nearest]), q * float(along[nearest])))
+            way.append((replace(screw, axis=axes[nearest]), q * float(along[nearest])))
     enough = hypothesis.error + share * max(trial.absent - hypothesis.error, 0.0) + NOISE * trial.absent
     for way in ways:
         judged = [trial.judge(trial.moved(hypothesis, screw.motion(q))) for screw, q in way]

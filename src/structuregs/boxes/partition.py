@@ -46,7 +46,7 @@ class PartSearch:
         config, box = self.config, trial.box
         screw, q = screw_at(part.hypothesis.motion, kind_of(part.hypothesis.motion), box.T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
-        if self.pieces.shows(trial, part.hypothesis):
+        if trial.shows(part.hypothesis):
             support = trial.there.support(trial.piece, motions)
             least = config.divided * part.weight * trial.there.pixels
             means = trial.piece.means.double().numpy()
@@ -173,11 +173,13 @@ class PartSearch:
             by_cost = sorted(again, key=trial.cost)
             gaps = displacements(stack_motions(shared), by_cost[0].motion, trial.box)
             losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
+            touching = np.array([self._continues(part, other) for other in others])
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
+            alike &= trial.shows(own) | touching  # what does not show in the other state says little of how it moves
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
-            best_of_its_own = min(h.error + h.against(part.weight) for h in again[: -len(shared)])
-            needless = np.array([h.error for h in as_they_move]) < best_of_its_own
-            alike |= needless & np.array([other.weight > part.weight and self._continues(part, other) for other in others])
+            best_of_its_own = min(h.error + trial.gone_in(h) + h.against(part.weight) for h in again[: -len(shared)])
+            needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
+            alike |= needless & touching & np.array([other.weight > part.weight for other in others])
 
             twin = int(np.argmin(np.where(alike, losses, np.inf)))
             if alike[twin]:

@@ -170,6 +170,7 @@ class Pieces:
             weight=weight,
             most=weight,
             near=self.voxel,
+            least=self.config.shows * weight,
         )
 
     def pulled(self, start: Hypothesis, trial: Trial, steps: int) -> Hypothesis:
@@ -181,12 +182,8 @@ class Pieces:
             steps: of the pull.
         """
         refined = refine(start, trial, steps, self.config.rate)
-        share = self.config.plain if self.shows(trial, refined) else self.config.plain_if_shut
+        share = self.config.plain if trial.shows(refined) else self.config.plain_if_shut
         return min(simplest(refined, trial, self.base_box, share), start, key=trial.cost)
-
-    def shows(self, trial: Trial, hypothesis: Hypothesis) -> bool:
-        """Whether the photos of the other state show more than the front of what was tried."""
-        return trial.there.absent - hypothesis.image_error > self.config.shows * trial.weight
 
     def sample(self, points: Float64[np.ndarray, "P 3"], most: int) -> Float64[np.ndarray, "Q 3"]:
         """At most so many of the points, drawn by chance."""

@@ -26,7 +26,7 @@ from .surface import planarity_loss, thickness
 from .variables import SPLAT_NAMES, Variables
 
 _REPORT_EVERY = 10
-_SQUARE_WITHIN = float(np.sin(np.deg2rad(4))) ** 2
+_SQUARE_WITHIN = float(np.sin(np.deg2rad(10))) ** 2
 _BOX_NAMES = ("box_quats", "box_centres", "log_half_extents")
 # What torch raises over a file that was cut short or is something else, and what reading another record raises.
 _DAMAGED = (RuntimeError, EOFError, OSError, UnpicklingError, AttributeError, KeyError, TypeError, ValueError)
@@ -160,7 +160,7 @@ class Fitter:
             with torch.no_grad():
                 motions = variables.motions()
             self.state.free_motions = motions.wxyz_xyz
-            kinds: list[JointKind] = [kind_of(motions[k]) for k in range(1, len(variables.counts))]
+            kinds = _kinds(variables.parts().detach())
             variables.hold(kinds)
             first, second = self.state.moments["motions"]
             self.state.moments["motions"], self.state.taken["motions"] = (torch.zeros_like(first), torch.zeros_like(second)), 0
@@ -241,8 +241,8 @@ class Fitter:
         """What is likelier whatever the photos say; posed: the splats in both states."""
         config = self.config
         loss = torch.zeros((), device=self.device)
-        if config.slide_along_base and self.state.variables.kinds is not None:
-            loss = loss + config.slide_along_base * askew(parts, self.state.variables.kinds)
+        if config.slide_along_base:
+            loss = loss + config.slide_along_base * askew(parts, self.state.variables.kinds or _kinds(parts.detach()))
         if config.tint_penalty:
             loss = loss + config.image_weight * config.tint_penalty * parts.tint.abs().mean()
         if config.opacity_penalty:
@@ -311,15 +311,22 @@ def _order(seed: int, state: int, turn: int, count: int) -> np.ndarray:
     return np.random.default_rng((seed, state, turn)).permutation(count)
 
 
-def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
-    """Sum over slides of the squared sine of the angle to the nearest axis of the base's box, no more than at 4 degrees.
+def _kinds(parts: PosedParts) -> list[JointKind]:
+    """The types of the moving parts as they now move."""
+    return [kind_of(parts.motions[k]) for k in range(1, len(parts))]
 
-    Drawers run square to what holds them, and the photos of a plain one say little about its direction.
+
+def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
+    """Sum over slides of the squared sine of the angle to the nearest axis of the base's box, no more than at 10 degrees.
+
+    Drawers run square to what holds them, and the photos of a plain one say little about its direction.  What slides by less
+    than a thousandth of the base's half diagonal has none.
     """
-    axes = parts.boxes.T_world_box.rotation[0].detach().T
+    least = float(parts.boxes.half_extents[0].detach().norm()) / 1000
+    axes, centres = parts.boxes.T_world_box.rotation[0].detach().T, parts.boxes.T_world_box.xyz.detach()
     total = axes.new_zeros(())
     for k, kind in enumerate(kinds, start=1):
         if kind == "prismatic":
-            direction = torch.nn.functional.normalize(parts.motions.xyz[k], dim=0)
+            direction = torch.nn.functional.normalize(parts.motions[k].apply(centres[k]) - centres[k], dim=0, eps=least)
             total = total + (1 - (axes @ direction).square().max()).clamp(max=_SQUARE_WITHIN)
     return total

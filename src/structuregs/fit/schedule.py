@@ -100,7 +100,7 @@ class FitConfig:
     planarity_size: int = 160
     """Size of the images that it is taken from: the side of a square with as many pixels."""
     slide_along_base: float = 1.0
-    """Of the squared sine of the angle between a slide and the nearest axis of the base's box, once joints are held."""
+    """Of the squared sine of the angle between a slide and the nearest axis of the base's box, where that is small."""
     join_at: float = 0.35
     """Part of the fit after which parts that touch and move alike are made one, and what need not move is left to the base;
     1 for never."""
