@@ -23,11 +23,12 @@ class Rates:
     """Of the colour difference between the states, rgb."""
     boxes: float = 3e-3
     """Of the boxes' poses and half extents (T_0), radians and world units."""
-    motions: float = 4e-3
-    """Of the motions (T_1), radians and world units."""
+    motions: float = 1e-3
+    """Of the motions (T_1), radians and world units: the search brings them near, and while splats are still unsettled a
+    higher rate would throw them off."""
     means_final: float = 0.02
     """Fraction of its start that the rate of the centres has fallen to at the end."""
-    poses_final: float = 0.02
+    poses_final: float = 0.1
     """The same for boxes and motions."""
     appearance_final: float = 0.2
     """The same for all other rates."""
