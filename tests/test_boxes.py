@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -36,7 +36,7 @@ from structuregs.boxes.hypotheses import (
     stack_motions,
     turn_about,
 )
-from structuregs.boxes.judge import Scene, Trial, refine
+from structuregs.boxes.judge import Scene, Trial, refine, simplest
 from structuregs.capture import Capture, TrueJoint
 from structuregs.geometry import SE3, Box, Screw
 from structuregs.joints import kind_of
@@ -289,6 +289,22 @@ def trial_of_screen() -> Trial:
     return Trial(there, here, looks[1].splats, looks[0].splats[inside[0]], screen, weight=0.1, most=0.1, near=0.0, least=0.01)
 
 
+@dataclass(frozen=True)
+class Loose(Trial):
+    """A part that the photos lose little by wherever it goes: `aside` for a unit that it comes to lie aside of `at`."""
+
+    at: SE3
+    aside: float
+
+    @property
+    def absent(self) -> float:
+        return 1.0
+
+    def judge(self, hypothesis: Hypothesis, quick: bool = False) -> Hypothesis:  # noqa: ARG002
+        aside = float((hypothesis.motion.xyz - self.at.xyz).norm())
+        return replace(hypothesis, image_error=0.1, back_error=0.1 + self.aside * aside)
+
+
 def distance_to_surface(points: np.ndarray, obj: KnownObject, state: int) -> Tensor:
     rows = []
     for item in (item for part in obj.parts for item in part.at_state(state)):
@@ -451,6 +467,19 @@ class TestParts:
         assert gap < 0.03
         assert found.error < start.error
         assert found.oddity == pytest.approx(oddity(found.motion, screen, trial.there.still), abs=1e-6)
+
+    @pytest.mark.parametrize("degrees", [5.0, 30.0])
+    def test_a_slide_that_photos_leave_loose_runs_along_an_axis(self, degrees: float):
+        angle = np.deg2rad(degrees)
+        slide = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0.3 * np.cos(angle), 0.0, 0.3 * np.sin(angle)], dtype=F64))
+        box = Box(NO_MOTION, torch.tensor([0.5, 0.3, 0.2], dtype=F64))
+        for aside, told in ((0.0, False), (10.0, True)):
+            known = {field.name: getattr(trial_of_screen(), field.name) for field in fields(Trial)}
+            trial = Loose(**known | {"box": box}, at=slide, aside=aside)
+            found = simplest(trial.judge(Hypothesis(slide, 0.0, 0.0, 0.0)), trial, box, 0.1).motion
+            assert float(found.angle) == 0
+            x, y, z = found.xyz.tolist()
+            assert (x, y, z) == pytest.approx(slide.xyz.tolist() if told else (0.3 * np.cos(angle), 0, 0), abs=1e-9)
 
     def test_the_photos_of_both_states_speak_for_the_true_motion(self):
         (true,) = looks_of("laptop")[0].joints

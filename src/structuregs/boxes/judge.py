@@ -219,8 +219,9 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
     """The hypothesis, or the simplest motion near it that the photos like about as well.
 
     A few photos of a small part hardly tell a slide from a slide with a little turn, or one along the box from one a little
-    askew; joints are built along boxes, and they turn or slide.  Tried in turn: the slide and the turn along an axis of
-    the base or the box, whichever is better, the slide, the turn.
+    askew; joints are built along boxes, and they turn or slide.  Tried in turn: the slide and the turn along the
+    nearest axis of the base or of the box, whichever is better, the slide, the turn.  Of a shut drawer without texture the
+    photos can leave the way loose by more than 20 degrees; how far off an axis may be is theirs to say.
 
     Args:
         hypothesis: a motion with its errors.
