@@ -23,7 +23,7 @@ class Rates:
     """Of the colour difference between the states, rgb."""
     boxes: float = 3e-3
     """Of the boxes' poses and half extents (T_0), radians and world units."""
-    motions: float = 1e-3
+    motions: float = 2e-3
     """Of the motions (T_1), radians and world units: the search brings them near, and while splats are still unsettled a
     higher rate would throw them off."""
     means_final: float = 0.02
