@@ -473,8 +473,8 @@ class TestParts:
         angle = np.deg2rad(degrees)
         slide = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0.3 * np.cos(angle), 0.0, 0.3 * np.sin(angle)], dtype=F64))
         box = Box(NO_MOTION, torch.tensor([0.5, 0.3, 0.2], dtype=F64))
+        known = {field.name: getattr(trial_of_screen(), field.name) for field in fields(Trial)}
         for aside, told in ((0.0, False), (10.0, True)):
-            known = {field.name: getattr(trial_of_screen(), field.name) for field in fields(Trial)}
             trial = Loose(**known | {"box": box}, at=slide, aside=aside)
             found = simplest(trial.judge(Hypothesis(slide, 0.0, 0.0, 0.0)), trial, box, 0.1).motion
             assert float(found.angle) == 0

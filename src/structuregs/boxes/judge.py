@@ -63,6 +63,10 @@ class Scene:
         """The same of the few photos of a quick look."""
         return self.error(self.rest[:0], SE3.identity(dtype=torch.float64), quick=True)
 
+    def without(self, quick: bool = False) -> float:
+        """`absent`, or `absent_quick`."""
+        return self.absent_quick if quick else self.absent
+
     @torch.no_grad()
     def footprint(self, part: Splats) -> float:
         """Mean share of the judging photos that shows the part where it is."""
@@ -154,12 +158,16 @@ class Trial:
 
         What takes more than `most` off one takes another part's place, which says nothing for it.
         """
-        without = [scene.absent_quick if quick else scene.absent for scene in (self.there, self.here)]
+        without = self.there.without(quick), self.here.without(quick)
         return sum(min(a - b, self.most) for a, b in zip(without, (hypothesis.image_error, hypothesis.back_error), strict=True))
 
     def shows(self, hypothesis: Hypothesis) -> bool:
         """Whether the photos of the other state show more than the front of the part where a judged hypothesis takes it."""
-        return self.there.absent - hypothesis.image_error > self.least
+        return self._shown(hypothesis) > self.least
+
+    def _shown(self, hypothesis: Hypothesis, quick: bool = False) -> float:
+        """What a judged hypothesis takes off the error of the other state's photos."""
+        return self.there.without(quick) - hypothesis.image_error
 
     def gone_in(self, hypothesis: Hypothesis, quick: bool = False) -> float:
         """What speaks against a judged turn after which little shows of the part, in mean error.
@@ -168,8 +176,8 @@ class Trial:
         """
         if kind_of(hypothesis.motion) == "prismatic":
             return 0.0
-        shown = (self.there.absent_quick if quick else self.there.absent) - hypothesis.image_error
-        return float(np.clip(_SHOWN_SHUT * self.weight - shown, 0, _SHOWN_SHUT * self.weight))
+        most = _SHOWN_SHUT * self.weight
+        return min(max(most - self._shown(hypothesis, quick), 0.0), most)
 
     def cost(self, hypothesis: Hypothesis, quick: bool = False) -> float:
         """What hypotheses are compared by: what speaks against them, less what they explain."""

@@ -175,7 +175,7 @@ class PartSearch:
             losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
             touching = np.array([self._continues(part, other) for other in others])
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
-            alike &= trial.shows(own) | touching  # what does not show in the other state says little of how it moves
+            alike &= trial.shows(starts[0]) | touching  # what does not show in the other state says little of how it moves
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
             best_of_its_own = min(h.error + trial.gone_in(h) + h.against(part.weight) for h in again[: -len(shared)])
             needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
