@@ -23,7 +23,7 @@ from structuregs.boxes import (
     survey,
 )
 from structuregs.boxes.appearance import AppearanceConfig
-from structuregs.boxes.divide import FACTORS, cut_fronts, divide
+from structuregs.boxes.divide import AROUND, FACTORS, cut_across, divide, moving_along
 from structuregs.boxes.hypotheses import (
     Hypothesis,
     candidate_motions,
@@ -500,15 +500,23 @@ class TestParts:
         assert trial.cost(greedy) == pytest.approx(-0.03)
         assert greedy.error < fair.error
 
-    def test_a_turn_speaks_the_less_for_itself_the_less_the_other_state_shows_of_it(self):
-        trial = replace(trial_of_screen(), weight=0.02, most=0.02)
+    def test_the_less_is_seen_of_a_part_after_a_turn_the_more_speaks_against_it(self):
+        trial = replace(trial_of_screen(), weight=0.02)
         (true,) = looks_of("laptop")[0].joints
-        slide = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0.1, 0.0, 0.0], dtype=F64))
-        for shown, against in ((-0.01, 0.006), (0.0, 0.006), (0.002, 0.004), (0.006, 0.0), (0.02, 0.0)):
-            turned, slid = (Hypothesis(T, 0.0, 0.0, 0.0, trial.there.absent - shown, 0.1) for T in (true.motion(), slide))
+        for seen, against in ((0.0, 0.006), (0.05, 0.0045), (0.2, 0.0), (0.8, 0.0)):
+            turned = Hypothesis(true.motion(), 0.0, 0.0, 0.0, 0.1, 0.1, seen)
             assert trial.gone_in(turned) == pytest.approx(against, abs=1e-9)
-            assert trial.gone_in(slid) == 0
-            assert trial.cost(turned) - trial.cost(slid) == pytest.approx(against, abs=1e-9)
+            assert trial.cost(turned) - trial.cost(replace(turned, seen=1.0)) == pytest.approx(against, abs=1e-9)
+
+    def test_how_much_is_seen_of_a_part_does_not_hang_on_its_colours(self):
+        trial = trial_of_screen()
+        (true,) = looks_of("laptop")[0].joints
+        away = Screw("revolute", torch.tensor([0.0, 0, 1], dtype=F64), torch.tensor([10.0, 0, 0], dtype=F64)).motion(math.pi)
+        for some in (trial, replace(trial, piece=replace(trial.piece, sh=torch.zeros_like(trial.piece.sh)))):
+            turned, gone, slid = (some.judge(Hypothesis(T, 0.0, 0.0, 0.0)) for T in (true.motion(), away, NO_MOTION))
+            assert 0.7 < turned.seen < 1.4
+            assert gone.seen == 0
+            assert slid.seen == 1, "only turns are asked"
 
     def test_what_a_splat_takes_off_the_error_adds_up_to_what_the_part_does(self):
         obj, looks = looks_of("laptop")
@@ -576,7 +584,7 @@ class TestDivide:
         assert len(divide(points, means, np.full((len(FACTORS), len(means)), -1.0), 1.6, 0.0, CueConfig(), voxel=0.05)) == 1
 
 
-class TestCutFronts:
+class TestCutAcross:
     """Three drawers side by side, shut in the other state; the outer ones come out .6 and .8 as far as the middle one."""
 
     WIDTHS = (-1.0, -0.4, 0.5, 1.0)
@@ -596,7 +604,7 @@ class TestCutFronts:
             (len(tried), 600)
         )
         along = Screw(kind, torch.tensor([0.0, 1, 0], dtype=F64), torch.zeros(3, dtype=F64))  # pyright: ignore[reportArgumentType]
-        return cut_fronts(points, self.BOX, fronts, support, along, voxel)
+        return cut_across(points, self.BOX, fronts, support, along, voxel, 1.13)
 
     def test_drawers_that_come_out_differently_are_cut_where_they_meet(self):
         pieces = sorted(self.pieces((0.6, 1.0, 0.8)), key=lambda piece: piece[:, 0].mean())
@@ -615,6 +623,32 @@ class TestCutFronts:
     def test_nothing_is_cut_where_the_motion_carries_it(self):
         (piece,) = self.pieces((0.6, 1.0, 0.8), kind="revolute")
         assert len(piece) == 2000, "the boards lie beside each other across the axis, not along it"
+
+
+class TestMovingAlong:
+    """A panel and a tray that hang together; the panel moves along with a door, whose photos show nothing of the tray."""
+
+    @staticmethod
+    def belongs(peak: float, so_far: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """What is said to move along, and what is the panel."""
+        generator = np.random.default_rng(0)
+        points, means = (generator.uniform([-1, -0.02, 0], [1, 0.02, 1], (n, 3)) for n in (3000, 600))
+        panel = means[:, 0] < 0
+        shown = 1 - 2 * np.abs(np.array(AROUND)[:, None] - peak)
+        support = np.where(panel, 0.4 * shown, 0.0) + 0.05 * generator.standard_normal((len(AROUND), 600))
+        before = np.full(600, so_far)
+        return moving_along(points, means, support, before, np.ones(600), CueConfig(), voxel=0.05), points[:, 0] < 0
+
+    def test_the_panel_belongs_to_the_door_and_the_tray_does_not(self):
+        found, panel = self.belongs(1.0)
+        assert (found == panel).mean() > 0.93
+
+    def test_what_goes_further_or_less_far_belongs_to_another(self):
+        for peak in (0.8, 1.2):
+            assert not self.belongs(peak)[0].any()
+
+    def test_what_is_explained_as_well_already_stays(self):
+        assert not self.belongs(1.0, so_far=0.38)[0].any()
 
 
 class TestBoxesOfParts:

@@ -18,6 +18,11 @@ class SearchConfig:
     many times as much off the photos' error as with one motion for all; of single parts it is .95 to 1.25 times..."""
     divided: float = 0.06
     """...and by more than this share of the cluster's weight: what hardly shows in the other state says nothing."""
+    cut: float = 1.04
+    """A cluster is cut across where its pieces, each going as far as suits it, explain so many times as much of both states'
+    photos as together: single parts have nowhere such a cut..."""
+    cut_shut: float = 1.13
+    """...and so many times, where only fronts show in the other state."""
     clear_case: float = 1.0
     """A part that explains less than this share of its weight, of the 2 that it could of both states' photos, waits until the
     other state's clusters have been tried: it may be several."""
@@ -53,6 +58,9 @@ class SearchConfig:
     """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
     alike: float = 0.12
     """...and if moving it just like the other costs the photos less than this fraction of the part's weight."""
+    crumbs: float = 0.3
+    """Of a part that is left with less than this share of its points, when one beside it has taken what moves along, nothing
+    stays."""
     shown: float = 0.2
     """Clusters are moved together if the photos of the other state then show this share of the weight of each."""
     large: float = 0.01

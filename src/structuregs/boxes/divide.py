@@ -15,12 +15,16 @@ from .cue import CueConfig, Points, box_around, linked
 FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
 """How far along its own way a motion is tried, against what suits the cluster best as a whole."""
 
-_TOGETHER = 1.13  # what is cut must explain so many times what it does as one...
-_BETTER = 1.04  # ...every cut so many times what it did before, ...
+AROUND = (0.8, 0.9, 1.0, 1.1, 1.2)
+"""The same for what may move along with a part: best at one of the middle three."""
+
+_BETTER = 1.04  # what is cut must explain so many times what it did before...
 _EACH = 0.08  # ...and every piece this share of what all do as one, and of the points
 _NARROWEST = 4  # voxels: no part beside another is narrower
 _POOL = 24  # neighbours over which a splat's support is averaged
 _VOTERS = 12  # splats around a point that say what it belongs to
+_ALONG = 0.06  # of what the photos of its own state lose without it: what moves along explains so much of the other's...
+_SURELY = 0.12  # ...and most of it so much
 
 
 def divide(
@@ -66,6 +70,42 @@ def divide(
     return [points[nearest == k] for k in range(len(pieces))]
 
 
+def moving_along(
+    points: Points,
+    means: Points,
+    support: Float64[np.ndarray, "F N"],
+    so_far: Float64[np.ndarray, " N"],
+    needed: Float64[np.ndarray, " N"],
+    cue: CueConfig,
+    voxel: float,
+) -> Bool[np.ndarray, " P"]:
+    """Which points beside a part belong to it: what its motion explains, and none that goes further or less far.
+
+    A door's panel and the tray behind it hang together in the state in which both are open.  Shut, the panel shows itself;
+    what the door's motion takes out of sight, or into the way, is something else.
+
+    Args:
+        points: what lies beside the part, in the world.
+        means: centres of its splats.
+        support: of each splat for each factor of `AROUND` of the part's motion (see `Scene.support`).
+        so_far: the same for the motion that it has been given so far.
+        needed: what each splat takes off the error of the photos of its own state.
+        cue: how near points hang together, and how few are noise.
+        voxel: of the hull, world units.
+    """
+    own = _pooled(means, needed[None])[0].clip(min=0)
+    along = _pooled(means, support - so_far)[AROUND.index(1.0)]
+    likely, surely = (_vote(points, means, along > share * own, own) for share in (_ALONG, _SURELY))
+    near = np.asarray(KDTree(means).query(points)[1])
+    belongs = np.zeros(len(points), bool)
+    for piece in linked(points[likely], cue, voxel):
+        chosen = KDTree(piece).query(points)[0] == 0
+        best = int(np.argmax(support[:, np.unique(near[chosen])].sum(1)))
+        clear = surely[chosen].mean() > 0.5 and 0 < best < len(AROUND) - 1
+        belongs |= chosen & bool(clear)
+    return belongs
+
+
 def _pooled(means: Points, support: Float64[np.ndarray, "F N"]) -> Float64[np.ndarray, "F N"]:
     """The mean support of each splat and its neighbours."""
     return support[:, KDTree(means).query(means, k=min(_POOL, len(means)))[1]].mean(2)
@@ -79,25 +119,28 @@ def _vote(
     return np.where(yes, weight, -weight)[near].sum(1) > 0
 
 
-def cut_fronts(
+def cut_across(
     points: Points,
     box: Box,
-    fronts: Float64[np.ndarray, "N 3"],
+    places: Float64[np.ndarray, "N 3"],
     support: Float64[np.ndarray, "F N"],
     screw: Screw,
     voxel: float,
+    together: float,
 ) -> list[Points]:
-    """The points of one cluster, cut where pieces of it would rather be pulled out by lengths of their own.
+    """The points of one cluster, cut where pieces of it would rather go ways of their own along its motion.
 
-    Drawers side by side are one cluster if they touch, and shut they show their fronts alone, flush with what stands still.
+    Drawers side by side and doors one above the other are one cluster if they touch, and shut they show their fronts alone,
+    flush with what stands still.
 
     Args:
         points: of the cluster, in the world.
         box: around them.
-        fronts: what shows in the other state where the cluster was, as it lies in the box's canonical space.
-        support: of each splat there for each of the factors, brought back (see `Scene.support`).
-        screw: along which the cluster moves as a whole.
+        places: of splats, in the box's canonical space: the cluster's, and of what shows in the other state where it was.
+        support: of each of them for each of the factors, moved there or brought back (see `Scene.support`).
+        screw: along which the cluster moves as a whole; cuts leave its way uncut.
         voxel: of the hull, world units.
+        together: the pieces must explain so many times what they do as one.
     """
     towards = (box.T_world_box.rotation.T @ screw.axis).abs()
     unmoved = towards < 0.2 if screw.kind == "prismatic" else towards > 0.98
@@ -105,8 +148,8 @@ def cut_fronts(
     axes = [int(axis) for axis in torch.nonzero(unmoved & wide).flatten()]
     common = float(support.sum(1).max())
     local = box.to_canonical(torch.from_numpy(points)).numpy()
-    pieces = _cut(fronts, support, local, axes, (_EACH * common, _EACH * len(local)))
-    if sum(reached for _, reached in pieces) < _TOGETHER * common:
+    pieces = _cut(places, support, local, axes, (_EACH * common, _EACH * len(local)))
+    if sum(reached for _, reached in pieces) < together * common:
         return [points]
     return [points[np.all((local > low) & (local <= high), axis=1)] for (low, high), _ in pieces]
 

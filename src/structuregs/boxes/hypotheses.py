@@ -32,6 +32,7 @@ class Hypothesis:
         oddity: how unlike a joint's the motion is (see `oddity`).
         image_error: mean absolute error of the other state's photos with the part moved so; infinite until looked at.
         back_error: the same of its own state's photos with what lies there in the other state moved back.
+        seen: what photos of the other state show of the part after a turn, over what those of its own do; 1 where not asked.
     """
 
     motion: SE3
@@ -40,6 +41,7 @@ class Hypothesis:
     oddity: float
     image_error: float = float("inf")
     back_error: float = float("inf")
+    seen: float = 1.0
 
     @property
     def error(self) -> float:

@@ -19,7 +19,8 @@ from .hypotheses import Hypothesis, oddity, turn_about
 
 _ALPHA_WEIGHT = 0.5  # of the mask's error beside the colour's
 _FEW = 4  # photos of either state that do for a quick look
-_SHOWN_SHUT = 0.3  # of a part's weight: so much the photos of a state in which a door or lid is shut lose without it
+_HIDDEN = 0.3  # of a part's weight speaks against a turn that hides the part, ...
+_SEEN_SHUT = 0.2  # ...none against one after which so much is seen of it, against its own state; shut doors show more
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
 
@@ -69,7 +70,7 @@ class Scene:
 
     @torch.no_grad()
     def footprint(self, part: Splats) -> float:
-        """Mean share of the judging photos that shows the part where it is."""
+        """Mean share of the judging photos that the part paints where it is."""
         both = Splats.concatenate([self.rest, part])
         chosen = torch.arange(len(both)) >= len(self.rest)
         return float(np.mean([painted_share(both, chosen, self.look.stack.cameras[v]) for v in self.views]))
@@ -143,11 +144,19 @@ class Trial:
         """What lies in the other state where a motion takes the part; still there."""
         return self.others[self.box.moved(motion).contains(self.others.means.double(), margin=self.near)]
 
+    @cached_property
+    def in_sight(self) -> float:
+        """Mean share of the photos of its own state that the part paints."""
+        return self.here.footprint(self.piece)
+
     def judge(self, hypothesis: Hypothesis, quick: bool = False) -> Hypothesis:
-        """The hypothesis with its errors."""
-        there = self.there.error(self.piece, hypothesis.motion, quick)
-        here = self.here.error(self.brought(hypothesis.motion), hypothesis.motion.inverse(), quick)
-        return replace(hypothesis, image_error=there, back_error=here)
+        """The hypothesis with its errors, and how much of the part is seen after a turn (which a quick look leaves out)."""
+        motion = hypothesis.motion
+        there = self.there.error(self.piece, motion, quick)
+        here = self.here.error(self.brought(motion), motion.inverse(), quick)
+        asked = not quick and kind_of(motion) == "revolute"
+        seen = self.there.footprint(self.piece.moved(motion)) / max(self.in_sight, 1e-12) if asked else 1.0
+        return replace(hypothesis, image_error=there, back_error=here, seen=seen)
 
     def moved(self, hypothesis: Hypothesis, motion: SE3) -> Hypothesis:
         """The hypothesis with another motion; what masks and photos say is still that of the old one."""
@@ -163,25 +172,19 @@ class Trial:
 
     def shows(self, hypothesis: Hypothesis) -> bool:
         """Whether the photos of the other state show more than the front of the part where a judged hypothesis takes it."""
-        return self._shown(hypothesis) > self.least
+        return self.there.absent - hypothesis.image_error > self.least
 
-    def _shown(self, hypothesis: Hypothesis, quick: bool = False) -> float:
-        """What a judged hypothesis takes off the error of the other state's photos."""
-        return self.there.without(quick) - hypothesis.image_error
+    def gone_in(self, hypothesis: Hypothesis) -> float:
+        """What speaks against a judged turn that takes the part out of sight, in mean error.
 
-    def gone_in(self, hypothesis: Hypothesis, quick: bool = False) -> float:
-        """What speaks against a judged turn after which little shows of the part, in mean error.
-
-        What the other state does not show has gone in somewhere: drawers and trays do, but a door that is shut shows itself.
+        What the other state does not show has gone in somewhere: drawers and trays do, but a door that is shut is seen,
+        however little it differs in colour from what it shuts off.
         """
-        if kind_of(hypothesis.motion) == "prismatic":
-            return 0.0
-        most = _SHOWN_SHUT * self.weight
-        return min(max(most - self._shown(hypothesis, quick), 0.0), most)
+        return self.weight * _HIDDEN * max(1 - hypothesis.seen / _SEEN_SHUT, 0.0)
 
     def cost(self, hypothesis: Hypothesis, quick: bool = False) -> float:
         """What hypotheses are compared by: what speaks against them, less what they explain."""
-        return hypothesis.against(self.weight) + self.gone_in(hypothesis, quick) - self.explained(hypothesis, quick)
+        return hypothesis.against(self.weight) + self.gone_in(hypothesis) - self.explained(hypothesis, quick)
 
     def gain(self, hypothesis: Hypothesis) -> float:
         """Fraction that the part takes off the error of both states' photos."""

@@ -14,7 +14,7 @@ from ..geometry import SE3, Box, screw_at
 from ..joints import kind_of
 from .config import SearchConfig
 from .cue import Cluster, Points, StateLook, linked
-from .divide import FACTORS, cut_fronts, divide
+from .divide import AROUND, FACTORS, cut_across, divide, moving_along
 from .hypotheses import (
     Hypothesis,
     candidate_motions,
@@ -41,25 +41,77 @@ class PartSearch:
     def _divided(self, part: MovingPart, trial: Trial, known_cut: bool) -> list[Points]:
         """The points of a part as those of several, if it turns out to be several parts; else all of them.
 
-        What shows in the other state says it splat by splat; what was shut there by its fronts, unless it was cut before.
+        What shows in the other state says it splat by splat; what was shut there by its fronts.  Unless it was cut before, it
+        is also cut across where its pieces had better go further or less far.
         """
-        config, box = self.config, trial.box
+        config, box, pieces = self.config, trial.box, self.pieces
         screw, q = screw_at(part.hypothesis.motion, kind_of(part.hypothesis.motion), box.T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
-        if trial.shows(part.hypothesis):
-            support = trial.there.support(trial.piece, motions)
+        shows = trial.shows(part.hypothesis)
+        there = trial.there.support(trial.piece, motions) if shows else np.zeros((len(FACTORS), 0))
+        means = trial.piece.means.double()
+        if shows:
             least = config.divided * part.weight * trial.there.pixels
-            means = trial.piece.means.double().numpy()
-            return divide(part.points, means, support, config.mixed, least, config.cue, self.pieces.voxel)
+            several = divide(part.points, means.numpy(), there, config.mixed, least, config.cue, pieces.voxel)
+            if len(several) > 1:
+                return several
         if known_cut:
             return [part.points]
-        means = trial.others.means.double()
-        fronts = trial.others[torch.stack([box.moved(motions[f]).contains(means) for f in range(len(FACTORS))]).any(0)]
-        there = box.moved(part.hypothesis.motion)
-        support = trial.here.support(fronts, motions.inverse())
-        return cut_fronts(
-            part.points, box, there.to_canonical(fronts.means.double()).numpy(), support, screw, self.pieces.voxel
+        others = trial.others.means.double()
+        fronts = trial.others[torch.stack([box.moved(motions[f]).contains(others) for f in range(len(FACTORS))]).any(0)]
+        back = trial.here.support(fronts, motions.inverse())
+        at = [box.moved(part.hypothesis.motion).to_canonical(fronts.means.double()).numpy()]
+        together = config.cut_shut
+        if shows:
+            at.append(box.to_canonical(means).numpy())
+            back = np.concatenate([back, there], 1)
+            together = config.cut
+        return cut_across(part.points, box, np.concatenate(at), back, screw, pieces.voxel, together)
+
+    def _exchanged(self, parts: list[MovingPart]) -> list[MovingPart]:
+        """The parts, each with what its motion explains better of those beside it than theirs; the weightiest takes first."""
+        parts = sorted(parts, key=lambda part: -part.weight)
+        for taker in range(len(parts)):
+            asked = {k for k, part in enumerate(parts) if k == taker or part.state != parts[taker].state}
+            while beside := [k for k in range(len(parts)) if k not in asked and self._touch(parts[taker], parts[k])]:
+                giver = beside[0]
+                asked.add(giver)
+                others = [part for k, part in enumerate(parts) if k not in (taker, giver)]
+                parts[taker], parts[giver] = self._with_claims(parts[taker], parts[giver], others)
+        return [part for part in parts if part.pieces]
+
+    def _with_claims(self, taker: MovingPart, giver: MovingPart, others: list[MovingPart]) -> tuple[MovingPart, MovingPart]:
+        """Two parts after the one has taken what moves along with it of the other, which may be all of it."""
+        pieces, state = self.pieces, taker.state
+        screw, q = screw_at(taker.hypothesis.motion, kind_of(taker.hypothesis.motion), pieces.box(taker.points).T_world_box.xyz)
+        motions = screw.motion(q * torch.tensor(AROUND, dtype=torch.float64)).wxyz_xyz
+        splats, mine = pieces.splats_of(giver), pieces.looks[state].splats
+        there = pieces.scene(1 - state, pieces.rest([*others, taker], state))
+        support = there.support(splats, SE3(torch.cat([motions, giver.hypothesis.motion.wxyz_xyz[None]])))
+        here = pieces.scene(state, mine[~pieces.held_by_part(giver)])
+        needed = here.support(splats, SE3.identity(1, dtype=torch.float64))[0]
+        means, voxel = splats.means.double().numpy(), pieces.voxel
+        along = moving_along(giver.points, means, support[:-1], support[-1], needed, self.config.cue, voxel)
+        if not along.any():
+            return taker, giver
+        left = linked(giver.points[~along], self.config.cue, voxel)
+        if sum(map(len, left)) < self.config.crumbs * len(giver.points):
+            return replace(taker, pieces=taker.pieces + giver.pieces, weight=taker.weight + giver.weight), replace(
+                giver, pieces=()
+            )
+        gone = along[KDTree(giver.points).query(means)[1]]
+        weight = float(needed[gone].sum()) / here.pixels
+        return (
+            replace(taker, pieces=(*taker.pieces, giver.points[along]), weight=taker.weight + weight),
+            replace(giver, pieces=tuple(left), weight=max(giver.weight - weight, 0.0)),
         )
+
+    def _touch(self, one: MovingPart, other: MovingPart) -> bool:
+        """Whether two parts, one of which may be empty, touch where they were found (the clustering's reach)."""
+        if not one.pieces or not other.pieces:
+            return False
+        gap = KDTree(other.points_in(one.state)).query(one.points)[0].min()
+        return bool(gap <= self.config.cue.link * self.pieces.voxel)
 
     def _replaced(self, index: int, points: list[Points]) -> list[int]:
         """Indices of new clusters in place of one; these do not move together."""
@@ -93,7 +145,8 @@ class PartSearch:
     def steps(self) -> Generator[int, None, list[MovingPart]]:
         """The search, bit by bit: yields how many clusters are done with, and returns the parts, the best first."""
         found = yield from self._found()
-        parts = self._reconsider([self._at_its_clearest(part) for part in found])
+        parts = self._exchanged(self._without_doubles(found))
+        parts = self._reconsider([self._at_its_clearest(part) for part in parts])
         return sorted(self._settled(self._without_pieces(parts)), key=lambda part: -part.weight)
 
     def _found(self) -> Generator[int, None, list[MovingPart]]:
@@ -120,7 +173,10 @@ class PartSearch:
             if doubtful and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
                 waiting.add(index)
                 waited.add(index)
-                todo.append(index)
+                at_last = [*(i for i in todo if i in waiting), index]
+                todo = [i for i in todo if i not in waiting] + sorted(
+                    at_last, key=lambda i: -len(self.pieces.clusters[i].points)
+                )
                 continue
             if len(several) > 1:
                 explained |= members
@@ -132,8 +188,8 @@ class PartSearch:
                 if large:
                     refused[index] = (part.state, share)
                 continue
-            parts.append(part)
             explained |= members | self._explained_by(part)
+            parts.append(part)
         self.left_over = [what for index, what in refused.items() if index not in explained]
         return parts
 
@@ -194,11 +250,28 @@ class PartSearch:
 
     def _continues(self, part: MovingPart, other: MovingPart) -> bool:
         """Whether two parts touch where the one was found (the clustering's reach), and one box holds both about as well."""
-        theirs = other.points_in(part.state)
-        if KDTree(theirs).query(part.points)[0].min() > self.config.cue.link * self.pieces.voxel:
+        if not self._touch(part, other):
             return False
+        theirs = other.points_in(part.state)
         whole, *both = (float(self.pieces.box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
         return sum(both) > self.config.cue.hollow * whole
+
+    def _without_doubles(self, parts: list[MovingPart]) -> list[MovingPart]:
+        """The parts, without those that lie where others do and beside them explain nothing: found wrong before."""
+        parts = list(parts)
+        index = 0
+        while index < len(parts):
+            part, others = parts[index], parts[:index] + parts[index + 1 :]
+            points = torch.from_numpy(part.points)
+            boxes = [self.pieces.box(other.points_in(part.state)) for other in others]
+            within = [box.contains(points, margin=3 * self.pieces.voxel) for box in boxes]
+            if others and float(torch.stack(within).any(0).double().mean()) > 0.6:
+                trial = self._again(part, others)
+                if trial.explained(trial.judge(part.hypothesis)) < 0:
+                    parts, index = others, 0
+                    continue
+            index += 1
+        return parts
 
     def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those that lie within a larger one: what was left over before that one was whole."""

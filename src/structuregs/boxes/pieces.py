@@ -134,8 +134,11 @@ class Pieces:
 
     def splats_of(self, part: MovingPart) -> Splats:
         """A part's splats in its own state: its pieces', as one box around all may hold some of the base."""
-        held = [self.held_by(points, part.state) for points in part.pieces]
-        return self.looks[part.state].splats[torch.stack(held).any(0)]
+        return self.looks[part.state].splats[self.held_by_part(part)]
+
+    def held_by_part(self, part: MovingPart) -> Bool[Tensor, " N"]:
+        """Which splats of a part's own state are its own."""
+        return torch.stack([self.held_by(points, part.state) for points in part.pieces]).any(0)
 
     def splats_in(self, members: set[int]) -> Splats:
         """The splats of the clusters in `members`, all of one state."""
