@@ -406,11 +406,14 @@ class TestCheckpoint:
             FitState.load(tmp_path / "last.pt")
 
 
-def sliding(way: Tensor) -> PosedParts:
-    """The door and the drawer in a turned base, the drawer sliding along a direction of the base's box."""
+def jointed(way: Tensor, tilt: float = 0.0) -> PosedParts:
+    """The door and the drawer in a turned base: the drawer slides along a direction of the base's box, the hinge is tilted."""
     parts = turned_parts()
+    axes = parts.boxes.T_world_box.rotation[0]
+    hinge = (axes @ torch.tensor([0.0, math.sin(tilt), math.cos(tilt)])).double()
     motions = parts.motions.wxyz_xyz.clone()
-    motions[2] = SE3.from_quat(SE3.identity().wxyz, parts.boxes.T_world_box.rotation[0] @ way).wxyz_xyz
+    motions[1] = Screw("revolute", hinge / hinge.norm(), torch.ones(3, dtype=torch.float64)).motion(0.8).wxyz_xyz.float()
+    motions[2] = SE3.from_quat(SE3.identity().wxyz, axes @ way).wxyz_xyz
     return replace(parts, motions=SE3(motions.requires_grad_()))
 
 
@@ -418,13 +421,14 @@ class TestAskew:
     @pytest.mark.parametrize("degrees", [0.0, 3.0, 8.0])
     def test_is_the_squared_sine_of_the_angle_to_the_nearest_axis(self, degrees: float):
         angle = math.radians(degrees)
-        parts = sliding(0.3 * torch.tensor([0.0, -math.cos(angle), math.sin(angle)]))
-        assert float(askew(parts, ["revolute", "prismatic"]).detach()) == pytest.approx(math.sin(angle) ** 2, abs=1e-6)
-        assert float(askew(parts, ["revolute", "revolute"])) == 0
+        slide = jointed(0.3 * torch.tensor([0.0, -math.cos(angle), math.sin(angle)]))
+        hinge = jointed(torch.tensor([0.0, -0.3, 0.0]), tilt=angle)
+        for parts in (slide, hinge):
+            assert float(askew(parts, ["revolute", "prismatic"]).detach()) == pytest.approx(math.sin(angle) ** 2, abs=1e-6)
 
     @pytest.mark.parametrize("way", [(0.2, 0.1, 0.0), (0.0, 0.0, 0.0), (1e-5, 1e-7, 0.0)])
     def test_does_not_draw_what_is_far_from_an_axis_or_stands_still(self, way: tuple[float, float, float]):
-        parts = sliding(torch.tensor(way))
+        parts = jointed(torch.tensor(way), tilt=math.radians(20))
         askew(parts, ["revolute", "prismatic"]).backward()
         assert parts.motions.wxyz_xyz.grad is not None
         assert float(parts.motions.wxyz_xyz.grad.abs().max()) == 0
@@ -434,7 +438,7 @@ class TestAskew:
         true = DRAWER.motion()
         skew = SE3.exp(torch.tensor([0.0, 0, 0, 0, 0, angle])).rotation @ true.xyz.float()
         parts = made_of(DOOR.motion(), SE3.from_quat(SE3.identity().wxyz, skew)).parts
-        blind = replace(QUICK, image_weight=1e-9, one_joint_from=1.0, steps=40, slide_along_base=1.0, join_at=1.0)
+        blind = replace(QUICK, image_weight=1e-9, one_joint_from=1.0, steps=40, along_base=1.0, join_at=1.0)
         fit = Fitter(photographed(made_of(DOOR.motion(), true)), blind, FitState.start(parts), 0, torch.device("cpu"))
         before = float(askew(parts, ["revolute", "prismatic"]))
         list(fit.run(40))

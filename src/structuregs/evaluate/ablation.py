@@ -14,7 +14,7 @@ def ablations(capture: Capture, config: FitConfig, folder: Path, seed: int) -> l
     rows = {
         "no_tint": ("no colour difference between the states", without_tint(config)),
         "free_joints": ("motions not held to one degree of freedom", replace(config, one_joint_from=1.0)),
-        "free_slides": ("slides not drawn to the base's axes", replace(config, slide_along_base=0.0)),
+        "free_axes": ("joints not drawn to the base's axes", replace(config, along_base=0.0)),
         "no_surface": (
             "no losses on surfaces",
             replace(config, planarity_weight=0.0, opacity_penalty=0.0, thickness_penalty=0.0),

@@ -241,8 +241,8 @@ class Fitter:
         """What is likelier whatever the photos say; posed: the splats in both states."""
         config = self.config
         loss = torch.zeros((), device=self.device)
-        if config.slide_along_base:
-            loss = loss + config.slide_along_base * askew(parts, self.state.variables.kinds or _kinds(parts.detach()))
+        if config.along_base:
+            loss = loss + config.along_base * askew(parts, self.state.variables.kinds or _kinds(parts.detach()))
         if config.tint_penalty:
             loss = loss + config.image_weight * config.tint_penalty * parts.tint.abs().mean()
         if config.opacity_penalty:
@@ -317,16 +317,17 @@ def _kinds(parts: PosedParts) -> list[JointKind]:
 
 
 def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
-    """Sum over slides of the squared sine of the angle to the nearest axis of the base's box, no more than at 10 degrees.
+    """Sum over joints of the squared sine of the angle to the nearest axis of the base's box, no more than at 10 degrees.
 
-    Drawers run square to what holds them, and the photos of a plain one say little about its direction.  What slides by less
-    than a thousandth of the base's half diagonal has none.
+    Drawers run square to what holds them and hinges lie along its edges, and the photos of a plain front say little about
+    either.  What slides by less than a thousandth of the base's half diagonal has no direction.
     """
     least = float(parts.boxes.half_extents[0].detach().norm()) / 1000
     axes, centres = parts.boxes.T_world_box.rotation[0].detach().T, parts.boxes.T_world_box.xyz.detach()
     total = axes.new_zeros(())
     for k, kind in enumerate(kinds, start=1):
-        if kind == "prismatic":
-            direction = torch.nn.functional.normalize(parts.motions[k].apply(centres[k]) - centres[k], dim=0, eps=least)
-            total = total + (1 - (axes @ direction).square().max()).clamp(max=_SQUARE_WITHIN)
+        motion = parts.motions[k]
+        way = motion.apply(centres[k]) - centres[k] if kind == "prismatic" else motion.wxyz[1:]
+        direction = torch.nn.functional.normalize(way, dim=0, eps=least if kind == "prismatic" else 1e-6)
+        total = total + (1 - (axes @ direction).square().max()).clamp(max=_SQUARE_WITHIN)
     return total

@@ -100,8 +100,8 @@ class FitConfig:
     """Part of the fit after which faces are made plane: what is hollow has to be found hollow before."""
     planarity_size: int = 160
     """Size of the images that it is taken from: the side of a square with as many pixels."""
-    slide_along_base: float = 1.0
-    """Of the squared sine of the angle between a slide and the nearest axis of the base's box, where that is small."""
+    along_base: float = 1.0
+    """Of the squared sine of the angle between a joint's axis and the nearest one of the base's box, where that is small."""
     join_at: float = 0.35
     """Part of the fit after which parts that touch and move alike are made one, and what need not move is left to the base;
     1 for never."""
@@ -140,7 +140,7 @@ PRESETS: dict[str, FitConfig] = {
         opacity_penalty=0.0,
         thickness_penalty=0.0,
         planarity_weight=0.0,
-        slide_along_base=0.0,
+        along_base=0.0,
         join_at=1.0,
         one_joint_from=1.0,
         checkpoint_every=500,
