@@ -37,6 +37,8 @@ from structuregs.boxes.hypotheses import (
     turn_about,
 )
 from structuregs.boxes.judge import Scene, Trial, refine, simplest
+from structuregs.boxes.pieces import Pieces
+from structuregs.boxes.review import PartReview
 from structuregs.capture import Capture, TrueJoint
 from structuregs.geometry import SE3, Box, Screw
 from structuregs.joints import kind_of
@@ -541,6 +543,41 @@ class TestParts:
         assert len(parts) == 2
         for true in obj.joints:
             assert min(errors(part.motion, part.points_in(0), true)[0] for part in parts) < 4
+
+
+class TestReview:
+    """The laptop's screen, found rightly and wrongly."""
+
+    @staticmethod
+    def found() -> tuple[PartReview, MovingPart, MovingPart]:
+        """A review, the screen as it was found, and the same with another motion."""
+        (part,) = parts_of("laptop")
+        wrong = replace(
+            part.hypothesis, motion=part.hypothesis.motion @ SE3.exp(torch.tensor([0, 0, 0.5, 0, 0.6, 0], dtype=F64))
+        )
+        review = PartReview(Pieces(looks_of("laptop")[1], SMALL.search, seed=0))
+        return review, part, replace(part, hypothesis=wrong)
+
+    def test_of_two_parts_in_one_place_the_wrong_one_goes(self):
+        review, right, wrong = self.found()
+        for parts in ([right, wrong], [wrong, right]):
+            (kept,) = review.without_doubles(parts)
+            assert kept is right
+        assert review.without_doubles([right]) == [right]
+
+    def test_a_part_takes_what_moves_along_from_one_that_moves_wrongly(self):
+        review, right, wrong = self.found()
+        points = right.points
+        left = points[:, 0] < 0.3
+        taker, giver = (
+            replace(right, pieces=(points[left],)),
+            replace(wrong, pieces=(points[~left],), weight=0.5 * right.weight),
+        )
+        (whole,) = review.exchanged([giver, taker])
+        assert whole.hypothesis is right.hypothesis
+        assert len(whole.points) == len(points)
+        rightly = replace(giver, hypothesis=right.hypothesis)
+        assert [len(part.points) for part in review.exchanged([taker, rightly])] == [left.sum(), (~left).sum()]
 
 
 class TestDivide:

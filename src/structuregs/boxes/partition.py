@@ -6,28 +6,25 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool
-from scipy.spatial import KDTree
-from torch import Tensor
 
 from ..geometry import SE3, Box, screw_at
 from ..joints import kind_of
 from .config import SearchConfig
 from .cue import Cluster, Points, StateLook, linked
-from .divide import AROUND, FACTORS, cut_across, divide, moving_along
+from .divide import FACTORS, cut_across, divide
 from .hypotheses import (
     Hypothesis,
     candidate_motions,
     displacements,
     distinct,
     finalists,
-    flips,
     hull_scores,
     oddity,
     stack_motions,
 )
 from .judge import NOISE, Scene, Trial, measured
 from .pieces import MovingPart, Pieces
+from .review import PartReview
 
 
 class PartSearch:
@@ -68,51 +65,6 @@ class PartSearch:
             together = config.cut
         return cut_across(part.points, box, np.concatenate(at), back, screw, pieces.voxel, together)
 
-    def _exchanged(self, parts: list[MovingPart]) -> list[MovingPart]:
-        """The parts, each with what its motion explains better of those beside it than theirs; the weightiest takes first."""
-        parts = sorted(parts, key=lambda part: -part.weight)
-        for taker in range(len(parts)):
-            asked = {k for k, part in enumerate(parts) if k == taker or part.state != parts[taker].state}
-            while beside := [k for k in range(len(parts)) if k not in asked and self._touch(parts[taker], parts[k])]:
-                giver = beside[0]
-                asked.add(giver)
-                others = [part for k, part in enumerate(parts) if k not in (taker, giver)]
-                parts[taker], parts[giver] = self._with_claims(parts[taker], parts[giver], others)
-        return [part for part in parts if part.pieces]
-
-    def _with_claims(self, taker: MovingPart, giver: MovingPart, others: list[MovingPart]) -> tuple[MovingPart, MovingPart]:
-        """Two parts after the one has taken what moves along with it of the other, which may be all of it."""
-        pieces, state = self.pieces, taker.state
-        screw, q = screw_at(taker.hypothesis.motion, kind_of(taker.hypothesis.motion), pieces.box(taker.points).T_world_box.xyz)
-        motions = screw.motion(q * torch.tensor(AROUND, dtype=torch.float64)).wxyz_xyz
-        splats, mine = pieces.splats_of(giver), pieces.looks[state].splats
-        there = pieces.scene(1 - state, pieces.rest([*others, taker], state))
-        support = there.support(splats, SE3(torch.cat([motions, giver.hypothesis.motion.wxyz_xyz[None]])))
-        here = pieces.scene(state, mine[~pieces.held_by_part(giver)])
-        needed = here.support(splats, SE3.identity(1, dtype=torch.float64))[0]
-        means, voxel = splats.means.double().numpy(), pieces.voxel
-        along = moving_along(giver.points, means, support[:-1], support[-1], needed, self.config.cue, voxel)
-        if not along.any():
-            return taker, giver
-        left = linked(giver.points[~along], self.config.cue, voxel)
-        if sum(map(len, left)) < self.config.crumbs * len(giver.points):
-            return replace(taker, pieces=taker.pieces + giver.pieces, weight=taker.weight + giver.weight), replace(
-                giver, pieces=()
-            )
-        gone = along[KDTree(giver.points).query(means)[1]]
-        weight = float(needed[gone].sum()) / here.pixels
-        return (
-            replace(taker, pieces=(*taker.pieces, giver.points[along]), weight=taker.weight + weight),
-            replace(giver, pieces=tuple(left), weight=max(giver.weight - weight, 0.0)),
-        )
-
-    def _touch(self, one: MovingPart, other: MovingPart) -> bool:
-        """Whether two parts, one of which may be empty, touch where they were found (the clustering's reach)."""
-        if not one.pieces or not other.pieces:
-            return False
-        gap = KDTree(other.points_in(one.state)).query(one.points)[0].min()
-        return bool(gap <= self.config.cue.link * self.pieces.voxel)
-
     def _replaced(self, index: int, points: list[Points]) -> list[int]:
         """Indices of new clusters in place of one; these do not move together."""
         state, before = self.pieces.clusters[index].state, len(self.pieces)
@@ -125,7 +77,7 @@ class PartSearch:
     def _left_of(self, index: int, parts: list[MovingPart]) -> list[int]:
         """What is left to explain of a cluster, by indices: itself, if no part lies there, or new clusters in its place."""
         cluster = self.pieces.clusters[index]
-        within = [self._within(part, cluster).numpy() for part in parts]
+        within = [self.pieces.within(part, cluster).numpy() for part in parts]
         share = float(np.any(within, 0).mean()) if parts else 0.0
         if share < 0.1:
             return [index]
@@ -145,9 +97,7 @@ class PartSearch:
     def steps(self) -> Generator[int, None, list[MovingPart]]:
         """The search, bit by bit: yields how many clusters are done with, and returns the parts, the best first."""
         found = yield from self._found()
-        parts = self._exchanged(self._without_doubles(found))
-        parts = self._reconsider([self._at_its_clearest(part) for part in parts])
-        return sorted(self._settled(self._without_pieces(parts)), key=lambda part: -part.weight)
+        return sorted(PartReview(self.pieces).reviewed(found), key=lambda part: -part.weight)
 
     def _found(self) -> Generator[int, None, list[MovingPart]]:
         """The parts as they are found, one after the other."""
@@ -188,141 +138,13 @@ class PartSearch:
                 if large:
                     refused[index] = (part.state, share)
                 continue
-            explained |= members | self._explained_by(part)
+            explained |= members | self.pieces.explained_by(part)
             parts.append(part)
         self.left_over = [what for index, what in refused.items() if index not in explained]
         return parts
 
     def _is_open(self, state: int, todo: set[int]) -> bool:
         return any(self.pieces.clusters[index].state == state for index in todo)
-
-    def _at_its_clearest(self, part: MovingPart) -> MovingPart:
-        """The part as the other state shows it, if it is as large there but thinner.
-
-        Where few views look along a panel, the hull carries more than the panel, and what is fitted to it lies askew.
-        """
-        pieces, other = self.pieces, 1 - part.state
-        there = [i for i in sorted(self._explained_by(part)) if pieces.clusters[i].state == other]
-        if not there:
-            return part
-        points = tuple(pieces.clusters[i].points for i in there)
-        now, then = pieces.box(part.points), pieces.box(np.concatenate(points))
-        smaller = then.half_extents.sort()[0] / now.half_extents.sort()[0]
-        if float(smaller.prod()) > self.config.thinner or float(smaller[1:].min()) < 0.8:
-            return part
-        back = [replace(h, motion=h.motion.inverse()) for h in (part.hypothesis, *part.rivals)]
-        weight = sum(pieces.weights[i] for i in there)
-        return replace(part, state=other, pieces=points, hypothesis=back[0], rivals=tuple(back[1:]), weight=weight)
-
-    def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
-        """Looks at each part again with all others in place; one that may as well move like another becomes one with it."""
-        parts = list(parts)
-        index = 0
-        while index < len(parts) > 1:
-            part, others = parts[index], parts[:index] + parts[index + 1 :]
-            trial = self._again(part, others)
-            shared = [p.motion if part.state == 0 else p.motion.inverse() for p in others]
-            own = part.hypothesis
-            as_they_move = [trial.judge(trial.moved(own, T)) for T in shared]
-            starts = [*(trial.judge(h) for h in (own, *part.rivals[:2])), *as_they_move]
-            again = [self.pieces.pulled(h, trial, self.config.steps) for h in starts]
-            by_cost = sorted(again, key=trial.cost)
-            gaps = displacements(stack_motions(shared), by_cost[0].motion, trial.box)
-            losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
-            touching = np.array([self._continues(part, other) for other in others])
-            alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
-            alike &= trial.shows(starts[0]) | touching  # what does not show in the other state says little of how it moves
-            # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
-            best_of_its_own = min(h.error + trial.gone_in(h) + h.against(part.weight) for h in again[: -len(shared)])
-            needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
-            alike |= needless & touching & np.array([other.weight > part.weight for other in others])
-
-            twin = int(np.argmin(np.where(alike, losses, np.inf)))
-            if alike[twin]:
-                follower, leader = sorted((part, others[twin]), key=lambda p: p.weight)
-                parts = self._merged(leader, follower, [p for p in others if p is not others[twin]])
-                index = 0
-                continue
-            chosen = distinct(stack_motions([h.motion for h in by_cost]), trial.box, 0.1, len(by_cost))
-            parts[index] = replace(part, hypothesis=by_cost[0], rivals=tuple(by_cost[c] for c in chosen[1:]))
-            index += 1
-        return parts
-
-    def _continues(self, part: MovingPart, other: MovingPart) -> bool:
-        """Whether two parts touch where the one was found (the clustering's reach), and one box holds both about as well."""
-        if not self._touch(part, other):
-            return False
-        theirs = other.points_in(part.state)
-        whole, *both = (float(self.pieces.box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
-        return sum(both) > self.config.cue.hollow * whole
-
-    def _without_doubles(self, parts: list[MovingPart]) -> list[MovingPart]:
-        """The parts, without those that lie where others do and beside them explain nothing: found wrong before."""
-        parts = list(parts)
-        index = 0
-        while index < len(parts):
-            part, others = parts[index], parts[:index] + parts[index + 1 :]
-            points = torch.from_numpy(part.points)
-            boxes = [self.pieces.box(other.points_in(part.state)) for other in others]
-            within = [box.contains(points, margin=3 * self.pieces.voxel) for box in boxes]
-            if others and float(torch.stack(within).any(0).double().mean()) > 0.6:
-                trial = self._again(part, others)
-                if trial.explained(trial.judge(part.hypothesis)) < 0:
-                    parts, index = others, 0
-                    continue
-            index += 1
-        return parts
-
-    def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
-        """The parts, without those that lie within a larger one: what was left over before that one was whole."""
-        kept: list[MovingPart] = []
-        for part in sorted(parts, key=lambda part: -len(part.points)):
-            points = torch.from_numpy(part.points)
-            within = [
-                self.pieces.box(whole.points_in(part.state)).contains(points, margin=3 * self.pieces.voxel).double().mean()
-                for whole in kept
-            ]
-            if not within or max(within) < 0.6:
-                kept.append(part)
-        return kept
-
-    def _again(self, part: MovingPart, others: list[MovingPart]) -> Trial:
-        """A part between the photos of both states, with all other parts in place."""
-        return self.pieces.trial(part.state, part.points, self.pieces.splats_of(part), part.weight, others)
-
-    def _settled(self, parts: list[MovingPart]) -> list[MovingPart]:
-        """The parts after a longer look at each and the ways it can lie, with the motions of the others as they now are."""
-        parts = list(parts)
-        for index, part in enumerate(parts):
-            trial = self._again(part, parts[:index] + parts[index + 1 :])
-            own = part.hypothesis
-            ways = [own, *part.rivals[:1], *(trial.moved(own, T) for T in flips(own.motion, trial.box))]
-            judged = [trial.judge(h) for h in ways]
-            hopeful = [h for h in judged if trial.cost(h) < trial.cost(judged[0]) + self.config.hopeless * part.weight]
-            again = [self.pieces.pulled(h, trial, 2 * self.config.steps) for h in hopeful]
-            parts[index] = replace(part, hypothesis=measured(min(again, key=trial.cost), trial))
-        return parts
-
-    def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
-        """The parts with two of them made one, which moves as the leader does."""
-        to_leader = leader.hypothesis.motion.inverse()
-        there = (
-            follower.pieces
-            if follower.state == leader.state
-            else tuple(to_leader.apply(torch.from_numpy(points)).numpy() for points in follower.pieces)
-        )
-        return [replace(leader, pieces=leader.pieces + there), *rest]
-
-    def _within(self, part: MovingPart, cluster: Cluster) -> Bool[Tensor, " P"]:
-        """Which points of a cluster of either state lie where the part is in that state."""
-        box = self.pieces.box(part.points)
-        there = box if cluster.state == part.state else box.moved(part.hypothesis.motion)
-        return there.contains(torch.from_numpy(cluster.points), margin=3 * self.pieces.voxel)
-
-    def _explained_by(self, part: MovingPart) -> set[int]:
-        """Clusters of either state that lie where the part is in that state."""
-        clusters = enumerate(self.pieces.clusters)
-        return {index for index, cluster in clusters if float(self._within(part, cluster).double().mean()) > 0.6}
 
     def _shortlist(self, index: int, done: set[int]) -> tuple[list[Hypothesis], list[int]]:
         """Motions that the other state's hull allows a cluster, the best first, and the clusters that may move with it."""

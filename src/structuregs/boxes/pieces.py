@@ -191,3 +191,14 @@ class Pieces:
     def sample(self, points: Float64[np.ndarray, "P 3"], most: int) -> Float64[np.ndarray, "Q 3"]:
         """At most so many of the points, drawn by chance."""
         return points if len(points) <= most else points[self.generator.choice(len(points), most, replace=False)]
+
+    def within(self, part: MovingPart, cluster: Cluster) -> Bool[Tensor, " P"]:
+        """Which points of a cluster of either state lie where the part is in that state."""
+        box = self.box(part.points)
+        there = box if cluster.state == part.state else box.moved(part.hypothesis.motion)
+        return there.contains(torch.from_numpy(cluster.points), margin=3 * self.voxel)
+
+    def explained_by(self, part: MovingPart) -> set[int]:
+        """Clusters of either state that lie where the part is in that state."""
+        clusters = enumerate(self.clusters)
+        return {index for index, cluster in clusters if float(self.within(part, cluster).double().mean()) > 0.6}
