@@ -60,9 +60,11 @@ class PartReview:
     def _with_claims(self, taker: MovingPart, giver: MovingPart, others: list[MovingPart]) -> tuple[MovingPart, MovingPart]:
         """Two parts after the one has taken what moves along with it of the other, which may be all of it."""
         pieces, state = self.pieces, taker.state
+        splats = pieces.splats_of(giver)
+        if not len(splats):  # crumbs that no photo asks for
+            return taker, giver
         screw, q = screw_at(taker.hypothesis.motion, kind_of(taker.hypothesis.motion), pieces.box(taker.points).T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(AROUND, dtype=torch.float64)).wxyz_xyz
-        splats = pieces.splats_of(giver)
         there = pieces.scene(1 - state, pieces.rest([*others, taker], state))
         here = pieces.scene(state, pieces.looks[state].splats[~pieces.held_by_part(giver)])
         support = there.support(splats, SE3(torch.cat([motions, giver.hypothesis.motion.wxyz_xyz[None]])))
@@ -87,7 +89,7 @@ class PartReview:
         Where few views look along a panel, the hull carries more than the panel, and what is fitted to it lies askew.
         """
         pieces, other = self.pieces, 1 - part.state
-        there = [i for i in sorted(self.pieces.explained_by(part)) if pieces.clusters[i].state == other]
+        there = [i for i in sorted(pieces.explained_by(part)) if pieces.clusters[i].state == other]
         if not there:
             return part
         points = tuple(pieces.clusters[i].points for i in there)
