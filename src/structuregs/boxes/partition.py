@@ -45,9 +45,9 @@ class PartSearch:
         screw, q = screw_at(part.hypothesis.motion, kind_of(part.hypothesis.motion), box.T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
         shows = trial.shows(part.hypothesis)
-        there = trial.there.support(trial.piece, motions) if shows else np.zeros((len(FACTORS), 0))
-        means = trial.piece.means.double()
         if shows:
+            means = trial.piece.means.double()
+            there = trial.there.support(trial.piece, motions)
             least = config.divided * part.weight * trial.there.pixels
             several = divide(part.points, means.numpy(), there, config.mixed, least, config.cue, pieces.voxel)
             if len(several) > 1:
@@ -56,14 +56,13 @@ class PartSearch:
             return [part.points]
         others = trial.others.means.double()
         fronts = trial.others[torch.stack([box.moved(motions[f]).contains(others) for f in range(len(FACTORS))]).any(0)]
-        back = trial.here.support(fronts, motions.inverse())
-        at = [box.moved(part.hypothesis.motion).to_canonical(fronts.means.double()).numpy()]
-        together = config.cut_shut
+        support = trial.here.support(fronts, motions.inverse())
+        places = box.moved(part.hypothesis.motion).to_canonical(fronts.means.double()).numpy()
         if shows:
-            at.append(box.to_canonical(means).numpy())
-            back = np.concatenate([back, there], 1)
-            together = config.cut
-        return cut_across(part.points, box, np.concatenate(at), back, screw, pieces.voxel, together)
+            support = np.concatenate([support, there], 1)
+            places = np.concatenate([places, box.to_canonical(means).numpy()])
+        together = config.cut if shows else config.cut_shut
+        return cut_across(part.points, box, places, support, screw, pieces.voxel, together)
 
     def _replaced(self, index: int, points: list[Points]) -> list[int]:
         """Indices of new clusters in place of one; these do not move together."""

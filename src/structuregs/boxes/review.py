@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from ..geometry import SE3, screw_at
 from ..joints import kind_of
@@ -34,9 +36,7 @@ class PartReview:
         index = 0
         while index < len(parts):
             part, others = parts[index], parts[:index] + parts[index + 1 :]
-            points = torch.from_numpy(part.points)
-            boxes = [self.pieces.box(other.points_in(part.state)) for other in others]
-            within = [box.contains(points, margin=3 * self.pieces.voxel) for box in boxes]
+            within = [self._lying_in(other, part) for other in others]
             if others and float(torch.stack(within).any(0).double().mean()) > 0.6:
                 trial = self._again(part, others)
                 if trial.explained(trial.judge(part.hypothesis)) < 0:
@@ -60,13 +60,14 @@ class PartReview:
     def _with_claims(self, taker: MovingPart, giver: MovingPart, others: list[MovingPart]) -> tuple[MovingPart, MovingPart]:
         """Two parts after the one has taken what moves along with it of the other, which may be all of it."""
         pieces, state = self.pieces, taker.state
-        splats = pieces.splats_of(giver)
+        held, mine = pieces.held_by_part(giver), pieces.looks[state].splats
+        splats = mine[held]
         if not len(splats):  # crumbs that no photo asks for
             return taker, giver
         screw, q = screw_at(taker.hypothesis.motion, kind_of(taker.hypothesis.motion), pieces.box(taker.points).T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(AROUND, dtype=torch.float64)).wxyz_xyz
         there = pieces.scene(1 - state, pieces.rest([*others, taker], state))
-        here = pieces.scene(state, pieces.looks[state].splats[~pieces.held_by_part(giver)])
+        here = pieces.scene(state, mine[~held])
         support = there.support(splats, SE3(torch.cat([motions, giver.hypothesis.motion.wxyz_xyz[None]])))
         needed = here.support(splats, SE3.identity(1, dtype=torch.float64))[0]
         means = splats.means.double().numpy()
@@ -154,14 +155,15 @@ class PartReview:
         """The parts, without those that lie within a larger one: what was left over before that one was whole."""
         kept: list[MovingPart] = []
         for part in sorted(parts, key=lambda part: -len(part.points)):
-            points = torch.from_numpy(part.points)
-            within = [
-                self.pieces.box(whole.points_in(part.state)).contains(points, margin=3 * self.pieces.voxel).double().mean()
-                for whole in kept
-            ]
+            within = [self._lying_in(whole, part).double().mean() for whole in kept]
             if not within or max(within) < 0.6:
                 kept.append(part)
         return kept
+
+    def _lying_in(self, one: MovingPart, other: MovingPart) -> Bool[Tensor, " P"]:
+        """Which points of the other part lie in the box of the one, in the state in which the other was found."""
+        box = self.pieces.box(one.points_in(other.state))
+        return box.contains(torch.from_numpy(other.points), margin=3 * self.pieces.voxel)
 
     def _settled(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts after a longer look at each and the ways it can lie, with the motions of the others as they now are."""
