@@ -20,6 +20,7 @@ from structuregs.boxes import (
     boxes_of_parts,
     clusters,
     find_parts,
+    strewn,
     survey,
 )
 from structuregs.boxes.appearance import AppearanceConfig
@@ -712,6 +713,16 @@ class TestBoxesOfParts:
             haunted.append(replace(look, hull=replace(look.hull, occupied=occupied)))
         found = boxes_of_parts((haunted[0], haunted[1]), parts_of("laptop"), SMALL)[0]
         torch.testing.assert_close(found.half_extents, clean.half_extents)
+
+    def test_splats_on_trial_are_strewn_evenly_in_and_around_them(self):
+        """What sticks out of a box by less than the reach, such as a handle, has some near it: half extents grow by it."""
+        boxes = boxes_of_parts(looks_of("laptop")[1], parts_of("laptop"), SMALL)[0]
+        generator = torch.Generator().manual_seed(0)
+        faint = strewn(boxes, SE3.identity(2), 4000, 0, generator, torch.ones(3), reach=0.2).splats
+        local = faint.means.reshape(2, -1, 3) * boxes.half_extents[:, None]
+        reach = boxes.half_extents + 0.2
+        assert (local.abs() <= reach[:, None] + 1e-6).all()
+        torch.testing.assert_close(local.std(1) * math.sqrt(3), reach, atol=0, rtol=0.03)
 
     def test_at_rest_nothing_moves_yet(self):
         obj, looks = looks_of("laptop")

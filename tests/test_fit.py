@@ -138,7 +138,7 @@ def gradients_of(count: int, strong: Tensor) -> ScreenGradients:
 
 
 class TestDensification:
-    growth = Growth(gradient=0.5, small=0.1, most=10_000, faint=0.01, outside=0.2)
+    growth = Growth(gradient=0.5, small=0.1, most=10_000, faint=0.01, reach=0.2)
     size = 1.0
 
     def grown(self, variables: Variables, strong: Tensor | None, growth: Growth | None = None, seed: int = 0):
@@ -152,13 +152,15 @@ class TestDensification:
             variables.leaves["log_scales"][large] = torch.tensor([0.2, 0.3, 0.4]).log()
         return variables
 
-    def test_pruning_takes_what_faded_and_what_left_its_box(self):
+    def test_pruning_takes_what_faded_and_what_went_far_from_its_box(self):
         variables = self.variables(slice(0, 0))
+        half = variables.leaves["log_half_extents"].exp()
         with torch.no_grad():
             variables.leaves["logit_opacities"][[0, 130]] = math.log(0.009 / 0.991)
             variables.leaves["logit_opacities"][1] = math.log(0.011 / 0.989)
-            variables.leaves["means"][[2, 140, 350]] = torch.tensor([0.0, -1.21, 0.0])
-            variables.leaves["means"][3] = torch.tensor([1.19, -1.19, 1.19])
+            for part, splat in enumerate((2, 140, 350)):
+                variables.leaves["means"][splat, 1] = -1 - 0.21 / half[part, 1]
+            variables.leaves["means"][3] = (1 + 0.19 / half[0]) * torch.tensor([1, -1, 1])
         after, source, fresh = self.grown(variables, None)
         assert sorted(source.tolist()) == [i for i in range(360) if i not in (0, 2, 130, 140, 350)]
         assert after.counts == (118, 118, 119)

@@ -15,13 +15,23 @@ FAINT = -2.2  # logit of the opacity of splats that are only on trial, about 0.1
 
 
 def strewn(
-    boxes: Box, motions: SE3, per_part: int, sh_degree: int, generator: torch.Generator, rgb: Float[Tensor, " 3"]
+    boxes: Box,
+    motions: SE3,
+    per_part: int,
+    sh_degree: int,
+    generator: torch.Generator,
+    rgb: Float[Tensor, " 3"],
+    reach: float = 0.0,
 ) -> PosedParts:
-    """Parts whose boxes are evenly strewn with faint splats of one colour (supplement 1.1: uniform in [-1, 1]^3)."""
+    """Parts whose boxes are evenly strewn with faint splats of one colour (supplement 1.1: uniform in [-1, 1]^3).
+
+    With a `reach` (world units) they are strewn so far around the boxes too.
+    """
     K = len(boxes.half_extents)
     means = torch.rand(K * per_part, 3, generator=generator) * 2 - 1
-    # Each splat about as large as its share of the box.
-    spacing = (boxes.volume / per_part) ** (1 / 3)
+    means *= (1 + reach / boxes.half_extents).repeat_interleave(per_part, 0)
+    # Each splat about as large as its share of the space.
+    spacing = ((2 * (boxes.half_extents + reach)).prod(-1) / per_part) ** (1 / 3)
     log_scales = (0.5 * spacing).log().repeat_interleave(per_part)[:, None].expand(-1, 3)
     sh = torch.zeros(K * per_part, (sh_degree + 1) ** 2, 3)
     sh[:, 0] = (rgb - 0.5) / SH_C0
@@ -43,6 +53,7 @@ def seeded(
     per_part: int,
     sh_degree: int,
     generator: torch.Generator,
+    reach: float,
 ) -> PosedParts:
     """Parts that begin as the quick looks show them, with faint splats strewn in for what these leave out.
 
@@ -58,6 +69,7 @@ def seeded(
         per_part: strewn splats in each box.
         sh_degree: of the spherical harmonics.
         generator: of the strewn splats' places.
+        reach: how far around the boxes splats are strewn, world units: looks miss what is thin and sticks out.
     """
     found = [sum(len(part.points) for part in parts if part.state == state) for state in (0, 1)]
     sources = [int(found[1] > found[0]), *(part.state for part in parts)]
@@ -72,7 +84,7 @@ def seeded(
         pieces.append(_in_box(look[inside], box, sh_degree))
     pieces = [pieces[-1], *pieces[:-1]]
     pieces[0] = _doubted(pieces[0], boxes, motions)
-    faint = strewn(boxes, motions, per_part, sh_degree, generator, looks[0].splats.base_rgb.mean(0))
+    faint = strewn(boxes, motions, per_part, sh_degree, generator, looks[0].splats.base_rgb.mean(0), reach)
     extra = [faint.part_splats(k) for k in range(len(sources))]
     extra[0] = extra[0][~_in_moving_box(boxes[0].to_world(extra[0].means), boxes, motions)]
     counts = tuple(len(piece) + len(more) for piece, more in zip(pieces, extra, strict=True))

@@ -59,10 +59,12 @@ def _moved_within(
 
 
 @torch.no_grad()
-def prune_mask(variables: Variables, growth: Growth) -> Bool[Tensor, " N"]:
-    """Splats to keep: neither faded nor out of their box."""
-    opaque = torch.sigmoid(variables.leaves["logit_opacities"]) > growth.faint
-    return opaque & (variables.leaves["means"].abs() < 1 + growth.outside).all(-1)
+def prune_mask(variables: Variables, growth: Growth, size: float) -> Bool[Tensor, " N"]:
+    """Splats to keep: neither faded nor far out of their box; size: of the object, world units."""
+    leaves = variables.leaves
+    opaque = torch.sigmoid(leaves["logit_opacities"]) > growth.faint
+    reach = 1 + growth.reach * size * (-leaves["log_half_extents"]).exp()
+    return opaque & (leaves["means"].abs() < reach[part_index(variables.counts, opaque.device)]).all(-1)
 
 
 def _along_curve(means: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
@@ -96,7 +98,7 @@ def grow(
         was or came from; and whether it is new.
     """
     count = sum(variables.counts)
-    keep = prune_mask(variables, growth)
+    keep = prune_mask(variables, growth, size)
     device = keep.device
     clone = split = torch.zeros(count, dtype=torch.bool, device=device)
     if gradients is not None:

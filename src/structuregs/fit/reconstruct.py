@@ -149,7 +149,8 @@ def start_parts(
                 lasting=True,
             )
         boxes, motions = boxes_of_parts(pair, found, config.start)
-        posed = seeded(boxes, motions, pair, found, *filling)
+        reach = config.growth.reach * float(boxes.half_extents.norm(dim=-1).max())
+        posed = seeded(boxes, motions, pair, found, *filling, reach)
     else:
         boxes, motions = boxes_at_rest(pair, parts, config.start)
         posed = strewn(boxes, motions, *filling, pair[0].splats.base_rgb.mean(0))

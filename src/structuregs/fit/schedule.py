@@ -52,8 +52,9 @@ class Growth:
     """No more splats than this."""
     faint: float = 0.005
     """Splats of lower opacity go."""
-    outside: float = 0.1
-    """Splats whose centre is farther than this outside the unit box go."""
+    reach: float = 0.1
+    """Splats whose centre is farther than this (times the object's size) outside their box go; where photos ask for what
+    sticks out of it, such as a handle that the looks missed, they find it."""
     reset: int = 0
     """Steps between two resets of the opacities; 0 for none."""
 
@@ -155,6 +156,6 @@ PRESETS: dict[str, FitConfig] = {
             poses_final=0.01,  # a constant 1e-2 shakes all splats of a box by a hundredth of its size
             appearance_final=1.0,
         ),
-        growth=Growth(first=0.05, last=0.5, reset=3000, most=50_000),
+        growth=Growth(first=0.05, last=0.5, reset=3000, most=50_000, reach=0.03),
     ),
 }
