@@ -141,6 +141,16 @@ def test_a_clear_door_needs_no_review():
     assert joint.review == ""
 
 
+def test_small_doubts_add_up():
+    """Two scores of .8, of the type and of the splats: either alone passes, both ask for a look."""
+    turn = hinge(5 * 3**0.8)[1]
+    one, other, both = (joints_of(posed(T, splats=n))[0] for T, n in ((turn, 200), (hinge(60)[1], 80), (turn, 80)))
+    assert not one.review
+    assert not other.review
+    assert both.confidence == pytest.approx(one.confidence * other.confidence, abs=0.02)
+    assert both.review
+
+
 def test_review_names_the_doubt():
     screw, turn = hinge(60)
     far = Screw("revolute", screw.axis, torch.tensor([0.0, 3, 0], dtype=torch.float64)).motion(math.radians(20))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import torch
 
 from ..capture import Capture, spread_cameras, stack_views
+from ..joints import REVIEW_BELOW
 from ..model import ArticulatedObject, Joint
 from ..raster import painted_share
 
@@ -18,8 +19,9 @@ def seen_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject:
     """The object with the confidence of its joints lowered where a part hardly shows in the photos of one state.
 
     The factor is the share of the photos that the part paints in the state where it paints less, over that in the other
-    state, times five, at most 1; below one half a sentence asks for a look.  A part that was shut shows its front (.3 to
-    .7 where measured); one that was behind a door shows .03 and less, and where it was then is a guess.
+    state, times five, at most 1; where that makes a joint doubtful, a sentence asks for a look.  A part that was shut
+    shows its front (.3 to .7 where measured); one that was behind a door shows .03 and less, and where it was then is a
+    guess.
 
     Args:
         obj: as fitted.
@@ -40,5 +42,6 @@ def _weighed(joint: Joint, shares: list[float]) -> Joint:
     """The joint after a look at the share of either state's photos that its part paints."""
     score = min(min(shares) / max(*shares, 1e-12) / _ENOUGH, 1.0)
     hidden = shares.index(min(shares))
-    sentence = f"Hardly a photo of state {hidden} shows the part: where it is there is a guess." if score < 0.5 else ""
-    return replace(joint, confidence=joint.confidence * score, review=joint.review or sentence)
+    confidence = joint.confidence * score
+    sentence = f"Hardly a photo of state {hidden} shows the part: where it is there is a guess."
+    return replace(joint, confidence=confidence, review=joint.review or (sentence if confidence < REVIEW_BELOW else ""))
