@@ -117,9 +117,11 @@ class PartReview:
             by_cost = sorted(again, key=trial.cost)
             gaps = displacements(stack_motions(shared), by_cost[0].motion, trial.box)
             losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
+            beside = np.array([self._touch(part, other) for other in others])
             touching = np.array([self._continues(part, other) for other in others])
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
-            alike &= trial.shows(starts[0]) | touching  # what does not show in the other state says little of how it moves
+            # What does not show in the other state says little of how it moves.
+            alike &= trial.shows(starts[0]) | touching | (beside & (gaps < self.config.same / 2))
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
             best_of_its_own = min(h.error + trial.gone_in(h) + h.against(part.weight) for h in again[: -len(shared)])
             needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
