@@ -26,7 +26,8 @@ def joint(kind: str = "revolute", *, failed: bool = False, angle: float = 0.5) -
 
 
 def report(*joints: dict, **others: object) -> dict:
-    base = {"joints": list(joints), "unmatched_parts": [], "flagged_parts": [], "psnr": 30.0, "seconds": 60.0, "peak_gb": 1.5}
+    base = {"protocol": "paris", "joints": list(joints), "unmatched_parts": [], "flagged_parts": [], "seconds": 60.0}
+    base |= {"psnr": 30.0, "psnr_by_state": [30.0, 30.0], "psnr_object": None, "peak_gb": 1.5}
     surfaces = {"cd_static": 1.0, "cd_movable": 2.0, "cd_whole": 3.0}
     return base | surfaces | {"failures": sum(j["failed"] for j in joints)} | others
 
@@ -151,6 +152,15 @@ class TestRunning:
         ]
         assert all("there is no such folder" in row.error for row in rows if row.report is None)
         assert not list(tmp_path.rglob("*.part"))
+
+    def test_what_an_older_version_scored_is_scored_again(self, tmp_path):
+        """Its report does not say which parts are flagged; the capture does not exist, so that scoring it again fails."""
+        self.finished(tmp_path, "10905", 0)
+        (file,) = (tmp_path / "runs").iterdir()
+        file.write_text(json.dumps({k: v for k, v in report(joint()).items() if k != "flagged_parts"}))
+        (row,) = bench(Bench((tmp_path / "10905",), tmp_path, seeds=(0,)))
+        assert row.report is None
+        assert "there is no such folder" in row.error
 
     def test_captures_of_one_name_are_told_apart(self, tmp_path):
         self.finished(tmp_path, "a_7", 0)

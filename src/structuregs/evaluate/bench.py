@@ -1,5 +1,6 @@
 """Many captures fitted and scored: one process for each fit, taken up again where it was left."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..export.assets import replace_file
+from .report import Report
 
 _COMMAND = (sys.executable, "-c", "from structuregs.cli import main; main()")
 
@@ -88,7 +90,7 @@ def _names(captures: Sequence[Path]) -> dict[Path, str]:
 def _row(plan: Bench, name: str, capture: Path, views: int | None, seed: int) -> BenchRow:
     run = plan.folder / "runs" / f"{name}_{plan.preset}_{'all' if views is None else views}_{seed}"
     file = run.with_name(f"{run.name}_{plan.protocol}.json")
-    if not file.exists():
+    if (report := _finished(file)) is None:
         run.parent.mkdir(parents=True, exist_ok=True)
         options = ["--preset", plan.preset, "--seed", str(seed), "--device", plan.device]
         options += [] if views is None else ["--views", str(views)]
@@ -99,10 +101,17 @@ def _row(plan: Bench, name: str, capture: Path, views: int | None, seed: int) ->
         except RuntimeError as error:
             return BenchRow(capture, views, seed, None, str(error))
         # On a run that was taken up again the memory is that of its last sitting.
-        record = json.loads(staged.read_text()) | {"peak_gb": peak}
-        replace_file(file, json.dumps(record, indent=1) + "\n")
+        report = json.loads(staged.read_text()) | {"peak_gb": peak}
+        replace_file(file, json.dumps(report, indent=1) + "\n")
         staged.unlink()
-    return BenchRow(capture, views, seed, json.loads(file.read_text()))
+    return BenchRow(capture, views, seed, report)
+
+
+def _finished(file: Path) -> dict[str, Any] | None:
+    """The report of an earlier call; None if there is none, or one of a version that did not count all that this one does."""
+    report = json.loads(file.read_text()) if file.exists() else {}
+    fields = {field.name for field in dataclasses.fields(Report)} - {"surfaces"}
+    return report if fields <= report.keys() else None
 
 
 def _call(plan: Bench, run: Path, *words: str) -> float:
