@@ -9,11 +9,12 @@ from torch import Tensor
 
 from door_and_drawer import DOOR, DRAWER, made_of, photographed
 from structuregs.capture import stack_views
+from structuregs.fit.boxes import squared_up, tightened
 from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
 from structuregs.fit.loop import FitState, Fitter, askew
 from structuregs.fit.merge import idle_part, moving_alike
-from structuregs.fit.reconstruct import RunFolder, choose_device, finished_object, tightened
+from structuregs.fit.reconstruct import RunFolder, choose_device, finished_object
 from structuregs.fit.schedule import PRESETS, FitConfig, Growth, Rates
 from structuregs.fit.variables import SPLAT_NAMES, Variables, part_index
 from structuregs.geometry import SE3, Box, Screw, quat_to_matrix
@@ -440,7 +441,7 @@ class TestAskew:
         true = DRAWER.motion()
         skew = SE3.exp(torch.tensor([0.0, 0, 0, 0, 0, angle])).rotation @ true.xyz.float()
         parts = made_of(DOOR.motion(), SE3.from_quat(SE3.identity().wxyz, skew)).parts
-        blind = replace(QUICK, image_weight=1e-9, one_joint_from=1.0, steps=40, along_base=1.0, join_at=1.0)
+        blind = replace(QUICK, image_weight=1e-9, one_joint_from=1.0, steps=40, along_base=1.0, join_at=1.0, square_at=())
         fit = Fitter(photographed(made_of(DOOR.motion(), true)), blind, FitState.start(parts), 0, torch.device("cpu"))
         before = float(askew(parts, ["revolute", "prismatic"]))
         list(fit.run(40))
@@ -530,6 +531,28 @@ class TestResult:
         assert opaque.abs().max() < 1.1
         assert ((opaque.abs() > 0.95).sum(0) >= 6).all(), "every face is reached, in each of three parts"
         assert (tight.boxes.half_extents < 0.55 * loose.boxes.half_extents).all()
+
+    def test_boxes_are_turned_along_the_faces_of_their_splats(self):
+        """Splats on the faces of the boxes; each box is then put askew, and comes back."""
+        parts = turned_parts()
+        generator = torch.Generator().manual_seed(0)
+        counts = (2000, 2000, 2000)
+        means = torch.rand(sum(counts), 3, generator=generator) * 2 - 1
+        axis = torch.randint(3, (len(means), 1), generator=generator)
+        means.scatter_(1, axis, means.gather(1, axis).sign())
+        source = torch.arange(len(parts)).repeat_interleave(2000) * 120
+        splats = replace(parts.splats[source], means=means, logit_opacities=torch.full((len(means),), 3.0))
+        right = replace(parts, splats=splats, counts=counts, tint=parts.tint[source])
+        askew_ = right
+        for k, turn in enumerate(((0.1, 0, 0.05), (-0.06, 0.08, 0.0), (0.02, 0.1, -0.1))):
+            R = right.boxes.T_world_box.rotation[k] @ SE3.exp(torch.tensor([0.0, 0, 0, *turn])).rotation
+            askew_ = askew_.in_box(k, Box.around(right.boxes.corners[k], R))
+        again = squared_up(askew_)
+        for state in (0, 1):
+            same_splats(again.at_state(state), right.at_state(state))
+        off = (again.boxes.T_world_box.inverse() @ right.boxes.T_world_box).angle
+        assert float(off.max()) < math.radians(0.5)
+        torch.testing.assert_close(again.boxes.half_extents, right.boxes.half_extents, atol=0.02, rtol=0.03)
 
     def test_a_held_joint_is_no_clearer_than_the_free_motion_was(self):
         variables = Variables.of(DOOR_AND_DRAWER)

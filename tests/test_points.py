@@ -10,10 +10,11 @@ import pytest
 import torch
 import trimesh
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from structuregs.capture import Capture, CaptureError, View
 from structuregs.geometry import SE3, Box, Camera
-from structuregs.points import Hull, Silhouettes, align_cameras, object_bounds, points_from
+from structuregs.points import Hull, Silhouettes, align_cameras, face_axes, object_bounds, points_from
 from structuregs.synthetic import RenderOptions, make_capture, make_object
 
 SIZE = 96
@@ -188,6 +189,41 @@ class TestDepthClouds:
 
 def cloud(count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(count, 3))
+
+
+def surface_of(half: Sequence[float], count: int, noise: float, seed: int) -> np.ndarray:
+    """Points strewn over the faces of a box around the origin, each as many as its area, with noise."""
+    points = trimesh.creation.box(2 * np.array(half)).sample(count, seed=seed)
+    return points + np.random.default_rng(seed).normal(0, noise, points.shape)
+
+
+def turned_by(first: np.ndarray, second: np.ndarray) -> float:
+    """Degrees between two frames."""
+    return float(np.degrees(Rotation.from_matrix(first.T @ second).magnitude()))
+
+
+class TestFaceAxes:
+    @pytest.mark.parametrize("off", [(0.0, 0.0, 7.0), (3.0, -8.0, 1.0), (-6.0, 5.0, 4.0)])
+    def test_finds_how_a_box_lies_though_something_sticks_out_at_corners(self, off: tuple[float, float, float]):
+        """The box of least volume around the same points lies askew by degrees."""
+        true = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+        knob = surface_of((0.04, 0.05, 0.04), 100, 0.004, 1)
+        at = np.array([0.55, 0.45, 0.2])
+        points = np.concatenate([surface_of((0.6, 0.4, 0.35), 3000, 0.004, 0), knob + at, knob - at]) @ true.T
+        start = true @ Rotation.from_euler("xyz", off, degrees=True).as_matrix()
+        assert turned_by(face_axes(points, start, 0.01), true) < 0.3
+        least = np.abs(trimesh.bounds.oriented_bounds(points)[0][:3, :3] @ true).max(0)
+        assert np.degrees(np.arccos(least.min())) > 2
+
+    def test_axes_that_are_right_stay_as_they_are(self):
+        points = surface_of((0.6, 0.4, 0.35), 3000, 0.004, 0)
+        assert face_axes(points, np.eye(3), 0.01).tolist() == np.eye(3).tolist()
+
+    def test_a_ball_has_none(self):
+        points = np.random.default_rng(0).normal(size=(4000, 3))
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+        start = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+        assert face_axes(points, start, 0.01).tolist() == start.tolist()
 
 
 class TestFiles:

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..capture import ImageStack
 from ..geometry import Box
 from ..model import Splats
-from ..points import Hull
+from ..points import Hull, face_axes
 
 Points = Float64[np.ndarray, "_ 3"]
 
@@ -75,6 +75,11 @@ def moving_points(points: Float64[np.ndarray, "P 3"], other: StateLook, threshol
     if not len(other.points):
         return carved
     return carved & (KDTree(other.points).query(points, distance_upper_bound=2 * threshold)[0] > threshold)
+
+
+def held_by_hull(points: Float64[np.ndarray, "P 3"], look: StateLook) -> Bool[np.ndarray, " P"]:
+    """Points that a state's visual hull holds, or that lie within a voxel of it."""
+    return look.hull.sample(look.hull.distance(), points, outside=np.inf) <= look.hull.voxel
 
 
 def clusters(looks: tuple[StateLook, StateLook], config: CueConfig) -> list[Cluster]:
@@ -147,16 +152,18 @@ def box_around(
 
 
 def base_axes(looks: tuple[StateLook, StateLook]) -> Float64[Tensor, "3 3"]:
-    """Axes, as columns, of what stands still: of the box around the largest solid that both hulls hold.
+    """Axes, as columns, of what stands still: those of its faces, near those of the largest solid that both hulls hold.
 
-    Points of a quick look at few photos stray too far from the surface to say how the whole lies.
+    Points of a quick look at few photos stray too far from the surface for a box around them to say how the whole lies.
     """
     hull = looks[0].hull
     both = hull.occupied & looks[1].hull.occupied
     if not both.any():
         return _tight_axes(looks[0].points)
     solids = np.asarray(skimage.measure.label(both, connectivity=1))
-    return _tight_axes(hull.centres(solids == np.bincount(solids[both]).argmax()))
+    axes = _tight_axes(hull.centres(solids == np.bincount(solids[both]).argmax()))
+    points = np.concatenate([look.points[held_by_hull(look.points, other)] for look, other in (looks, looks[::-1])])
+    return torch.from_numpy(face_axes(points, axes.numpy(), 0.5 * hull.voxel)) if len(points) else axes
 
 
 def _tight_axes(points: Float64[np.ndarray, "P 3"]) -> Float64[Tensor, "3 3"]:

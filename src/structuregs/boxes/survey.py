@@ -13,7 +13,7 @@ from ..geometry import SE3, Box
 from ..points import Clouds, Silhouettes, object_bounds
 from .appearance import AppearanceConfig, fit_state, surface_points
 from .config import SearchConfig
-from .cue import StateLook, base_axes, box_around, clusters
+from .cue import StateLook, base_axes, box_around, clusters, held_by_hull
 from .partition import PartSearch
 from .pieces import MovingPart
 
@@ -82,7 +82,7 @@ def _still_points(looks: tuple[StateLook, StateLook], moving: list[tuple[Box, Bo
     rows = []
     for look, other in (looks, looks[::-1]):
         points = torch.from_numpy(look.points)
-        still = torch.from_numpy(other.hull.sample(other.hull.distance(), look.points, outside=np.inf) <= other.hull.voxel)
+        still = torch.from_numpy(held_by_hull(look.points, other))
         for pair in moving:
             for box in pair:
                 still &= ~box.contains(points)

@@ -17,6 +17,7 @@ from ..geometry import SE3, JointKind
 from ..joints import kind_of
 from ..model import PosedParts, Splats
 from ..raster import image_loss, render
+from .boxes import squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
 from .merge import idle_part, moving_alike
@@ -130,6 +131,8 @@ class Fitter:
         while self.state.step < min(steps, self.config.steps):
             if self.state.step == round(self.config.join_at * self.config.steps):
                 yield from self._merge_parts()
+            if self.state.step in [round(at * self.config.steps) for at in self.config.square_at]:
+                self._square_up()
             yield from self._settle_joints()
             loss, psnr = self._step()
             self._densify()
@@ -152,6 +155,14 @@ class Fitter:
             self.state = replace(FitState.start(parts.joined(*pair)), size=self.state.size, step=step)
             what = "a part that need not move is the base's" if idle else "two parts that move alike are one"
             yield Note(f"{what} from step {step} on; {len(parts) - 2} left")
+
+    @torch.no_grad()
+    def _square_up(self) -> None:
+        """Turns boxes along the faces of their parts: joints are drawn to the axes of the base's."""
+        leaves = self.state.variables.leaves
+        for name, value in Variables.of(squared_up(self.state.variables.parts())).leaves.items():
+            if name != "motions":
+                leaves[name].copy_(value)
 
     def _settle_joints(self) -> Iterator[FitEvent]:
         """Holds every motion to one degree of freedom once its time has come."""

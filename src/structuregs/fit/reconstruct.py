@@ -14,10 +14,11 @@ import torch
 
 from ..boxes import MovingPart, PartSearch, boxes_at_rest, boxes_of_parts, look_at_states, seeded, strewn
 from ..capture import Capture
-from ..geometry import SE3, Box
+from ..geometry import SE3
 from ..joints import articulate, joints_of
 from ..model import ArticulatedObject, PosedParts, load_object, save_object
 from ..points import points_from
+from .boxes import tightened
 from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
 from .evidence import seen_in_both
 from .loop import FitState, Fitter
@@ -172,26 +173,6 @@ def _searched(search: PartSearch) -> Generator[FitEvent, None, list[MovingPart]]
         except StopIteration as done:
             yield Step("search", max(clusters, 1), None, None, 0)
             return done.value
-
-
-def tightened(parts: PosedParts) -> PosedParts:
-    """The same splats in boxes that reach just as far as their opaque splats do."""
-    parts = parts.detach()
-    centres, half_extents, means = [], [], []
-    for k, canonical in enumerate(parts.splats.means.split(parts.counts)):
-        box = parts.boxes[k]
-        local = canonical * box.half_extents
-        opaque = local[parts.part_splats(k).opacities > 0.3]
-        low, high = (
-            (opaque.quantile(q, 0) for q in (0.002, 0.998)) if len(opaque) > 10 else (-box.half_extents, box.half_extents)
-        )
-        half = ((high - low) / 2).clamp(min=1e-6)
-        centre = (high + low) / 2
-        centres.append(box.T_world_box.apply(centre))
-        half_extents.append(half)
-        means.append((local - centre) / half)
-    boxes = Box(SE3.from_quat(parts.boxes.T_world_box.wxyz, torch.stack(centres)), torch.stack(half_extents))
-    return replace(parts, boxes=boxes, splats=replace(parts.splats, means=torch.cat(means)))
 
 
 def finished_object(state: FitState) -> ArticulatedObject:

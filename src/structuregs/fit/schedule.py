@@ -103,6 +103,8 @@ class FitConfig:
     """Size of the images that it is taken from: the side of a square with as many pixels."""
     along_base: float = 1.0
     """Of the squared sine of the angle between a joint's axis and the nearest one of the base's box, where that is small."""
+    square_at: tuple[float, ...] = (0.35, 0.6)
+    """Parts of the fit after which boxes are turned along the faces of their parts."""
     join_at: float = 0.35
     """Part of the fit after which parts that touch and move alike are made one, and what need not move is left to the base;
     1 for never."""
@@ -142,6 +144,7 @@ PRESETS: dict[str, FitConfig] = {
         thickness_penalty=0.0,
         planarity_weight=0.0,
         along_base=0.0,
+        square_at=(),
         join_at=1.0,
         one_joint_from=1.0,
         checkpoint_every=500,

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..geometry import SE3, Box, quat_multiply
+from ..geometry import SE3, Box, quat_multiply, quat_to_matrix
 from .place import placed
 from .sh import rotate_sh
 from .splats import SH_C0, Splats
@@ -106,6 +106,20 @@ class PosedParts:
         return PosedParts(
             Box(SE3(pose[kept]), half_extents[kept]), SE3(self.motions.wxyz_xyz[kept]), splats, counts, self.tint[order]
         )
+
+    def in_box(self, k: int, box: Box) -> "PosedParts":
+        """The same splats with another box around part k, in state 0."""
+        turn = quat_multiply(box.T_world_box.inverse().wxyz, self.boxes.T_world_box.wxyz[k])
+        rows = self.part == k
+        means, quats, sh = self.splats.means.clone(), self.splats.quats.clone(), self.splats.sh.clone()
+        means[rows] = box.to_canonical(self.boxes[k].to_world(means[rows]))
+        quats[rows] = quat_multiply(turn, quats[rows])
+        if sh.shape[1] > 1:
+            sh[rows] = rotate_sh(sh[rows], quat_to_matrix(turn))
+        pose, half_extents = self.boxes.T_world_box.wxyz_xyz.clone(), self.boxes.half_extents.clone()
+        pose[k], half_extents[k] = box.T_world_box.wxyz_xyz, box.half_extents
+        splats = replace(self.splats, means=means, quats=quats, sh=sh)
+        return replace(self, boxes=Box(SE3(pose), half_extents), splats=splats)
 
     def part_splats(self, k: int) -> Splats:
         """The splats of one part, in its box's canonical space."""

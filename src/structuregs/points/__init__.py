@@ -2,6 +2,7 @@
 
 from .alignment import Alignment, Similarity, align_cameras
 from .clouds import Clouds, points_from
+from .faces import face_axes
 from .hull import Hull, Silhouettes, object_bounds
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "Silhouettes",
     "Similarity",
     "align_cameras",
+    "face_axes",
     "object_bounds",
     "points_from",
 ]
