@@ -1,8 +1,6 @@
 """Boxes that follow what their splats have become."""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from ..geometry import SE3, Box
 from ..model import PosedParts
@@ -18,12 +16,12 @@ def tightened(parts: PosedParts) -> PosedParts:
     """The same splats in boxes that reach just as far as their opaque splats do."""
     parts = parts.detach()
     for k in range(len(parts)):
-        parts = parts.in_box(k, _tight(parts, k, parts.boxes.T_world_box.rotation[k]))
+        parts = parts.in_box(k, _tight(parts, k))
     return parts
 
 
 def squared_up(parts: PosedParts) -> PosedParts:
-    """The same splats in boxes that are turned along the parts' faces, as opaque splats show them, and tight around them."""
+    """The same splats in boxes of the same size and place, turned along the parts' faces, as opaque splats show them."""
     parts = parts.detach()
     cell = _CELL * float(parts.boxes.half_extents[0].max())
     for k in range(len(parts)):
@@ -32,15 +30,16 @@ def squared_up(parts: PosedParts) -> PosedParts:
         if len(points) >= _FACES:
             start = box.T_world_box.rotation.double().cpu().numpy()
             axes = torch.from_numpy(face_axes(points.double().cpu().numpy(), start, cell)).to(points)
-            parts = parts.in_box(k, _tight(parts, k, axes))
+            parts = parts.in_box(k, Box(SE3.from_rotation(axes, box.T_world_box.xyz), box.half_extents))
     return parts
 
 
-def _tight(parts: PosedParts, k: int, axes: Float[Tensor, "3 3"]) -> Box:
-    """The box with these axes that holds all opaque splats of a part but a few; its own if it has hardly any."""
-    splats = parts.part_splats(k)
-    opaque = parts.boxes[k].to_world(splats.means)[splats.opacities > _OPAQUE] @ axes
+def _tight(parts: PosedParts, k: int) -> Box:
+    """A part's box, as large as holds all its opaque splats but a few; as it is if the part has hardly any."""
+    box, splats = parts.boxes[k], parts.part_splats(k)
+    opaque = splats.means[splats.opacities > _OPAQUE] * box.half_extents
     if len(opaque) <= _ENOUGH:
-        return parts.boxes[k]
+        return box
     low, high = (opaque.quantile(q, 0) for q in (0.002, 0.998))
-    return Box(SE3.from_rotation(axes, axes @ ((high + low) / 2)), ((high - low) / 2).clamp(min=1e-6))
+    pose = SE3.from_quat(box.T_world_box.wxyz, box.T_world_box.apply((high + low) / 2))
+    return Box(pose, ((high - low) / 2).clamp(min=1e-6))
