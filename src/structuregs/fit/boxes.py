@@ -12,6 +12,11 @@ _FACES = 100  # ...and so many which way it lies
 _CELL = 0.005  # of the base's longest half extent: how finely layers of splats are told apart
 
 
+def object_size(boxes: Box) -> float:
+    """About the radius of an object, world units: half the diagonal of its largest box."""
+    return float(boxes.half_extents.norm(dim=-1).max())
+
+
 def tightened(parts: PosedParts) -> PosedParts:
     """The same splats in boxes that reach just as far as their opaque splats do."""
     parts = parts.detach()

@@ -17,7 +17,7 @@ from ..geometry import SE3, JointKind
 from ..joints import kind_of
 from ..model import PosedParts, Splats
 from ..raster import image_loss, render
-from .boxes import squared_up
+from .boxes import object_size, squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
 from .merge import idle_part, moving_alike
@@ -60,14 +60,13 @@ class FitState:
         """The state before the first step."""
         variables = Variables.of(parts)
         gradients = ScreenGradients.zeros(sum(parts.counts), parts.tint.device)
-        size = float(parts.boxes.half_extents.norm(dim=-1).max())
         return FitState(
             variables,
             _no_moments(variables),
             dict.fromkeys(variables.leaves, 0),
             gradients,
             parts.motions.wxyz_xyz.clone(),
-            size,
+            object_size(parts.boxes),
             0,
         )
 

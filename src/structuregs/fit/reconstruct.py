@@ -18,7 +18,7 @@ from ..geometry import SE3
 from ..joints import articulate, joints_of
 from ..model import ArticulatedObject, PosedParts, load_object, save_object
 from ..points import points_from
-from .boxes import tightened
+from .boxes import object_size, tightened
 from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
 from .evidence import seen_in_both
 from .loop import FitState, Fitter
@@ -150,8 +150,7 @@ def start_parts(
                 lasting=True,
             )
         boxes, motions = boxes_of_parts(pair, found, config.start)
-        reach = config.growth.reach * float(boxes.half_extents.norm(dim=-1).max())
-        posed = seeded(boxes, motions, pair, found, *filling, reach)
+        posed = seeded(boxes, motions, pair, found, *filling, config.growth.reach * object_size(boxes))
     else:
         boxes, motions = boxes_at_rest(pair, parts, config.start)
         posed = strewn(boxes, motions, *filling, pair[0].splats.base_rgb.mean(0))

@@ -89,23 +89,12 @@ class PosedParts:
         """The same with part b made a piece of part a, whose motion and box axes the two then share; b's row goes."""
         R = self.boxes.T_world_box.rotation[a]
         box = Box.around(torch.cat([self.boxes.corners[a], self.boxes.corners[b]]), R)
-        turn = quat_multiply(box.T_world_box.inverse().wxyz, self.boxes.T_world_box.wxyz[b])
-        pieces = list(zip(self.splats.means.split(self.counts), self.splats.quats.split(self.counts), strict=True))
-        means = [mean for mean, _ in pieces]
-        quats = [quat for _, quat in pieces]
-        for k in (a, b):
-            means[k] = box.to_canonical(self.boxes[k].to_world(means[k]))
-        quats[b] = quat_multiply(turn, quats[b])
+        both = self.in_box(a, box).in_box(b, box)
         rows = torch.arange(len(self.part)).split(self.counts)
         kept = [k for k in range(len(self)) if k != b]
         order = torch.cat([torch.cat([rows[a], rows[b]]) if k == a else rows[k] for k in kept])
-        splats = replace(self.splats, means=torch.cat(means), quats=torch.cat(quats))[order]
-        pose, half_extents = self.boxes.T_world_box.wxyz_xyz.clone(), self.boxes.half_extents.clone()
-        pose[a], half_extents[a] = box.T_world_box.wxyz_xyz, box.half_extents
         counts = tuple(self.counts[k] + (self.counts[b] if k == a else 0) for k in kept)
-        return PosedParts(
-            Box(SE3(pose[kept]), half_extents[kept]), SE3(self.motions.wxyz_xyz[kept]), splats, counts, self.tint[order]
-        )
+        return PosedParts(both.boxes[kept], self.motions[kept], both.splats[order], counts, self.tint[order])
 
     def in_box(self, k: int, box: Box) -> "PosedParts":
         """The same splats with another box around part k, in state 0."""
