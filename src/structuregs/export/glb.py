@@ -53,8 +53,7 @@ def export_glb(
     if len(meshes) != len(obj.parts):
         raise ValueError(f"export_glb: {len(meshes)} meshes for an object of {len(obj.parts)} parts; give one for each part.")
     origins = _origins(obj)
-    placed = obj.parts.place(obj.parts.boxes, 0.0)
-    pieces = [placed[rows] for rows in torch.arange(len(placed)).split(obj.parts.counts)]
+    pieces = obj.parts.place(obj.parts.boxes, 0.0).split(obj.parts.counts)
 
     splats, surfaces = _Glb(), _Glb()
     shapes = [_add_splats(splats, piece, origin, scale) for piece, origin in zip(pieces, origins, strict=True)]

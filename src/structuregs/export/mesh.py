@@ -50,8 +50,7 @@ def part_meshes(obj: ArticulatedObject, capture: Capture, *, voxel: float | None
     volumes = [_volume(parts.boxes.half_extents[k].double().numpy(), voxel) for k in range(len(parts))]
     for state, views in enumerate(capture.train):
         boxes = parts.boxes.moved(parts.motions) if state else parts.boxes
-        splats = parts.at_state(state)
-        pieces = [splats[rows] for rows in torch.arange(len(splats)).split(parts.counts)]
+        pieces = parts.at_state(state).split(parts.counts)
         for looks in _batches(pieces, boxes, stack_views(views, _SIZE), _TRUNCATION * voxel):
             for k, volume in enumerate(volumes):
                 volume.fuse(

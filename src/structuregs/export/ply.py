@@ -20,8 +20,7 @@ def export_ply(obj: ArticulatedObject, folder: Path) -> list[Path]:
         folder: made where it is missing.
     """
     states = [obj.parts.at_state(state) for state in (0, 1)]
-    rows = torch.arange(len(states[0])).split(obj.parts.counts)
-    sets = {name: states[0][row] for name, row in zip(obj.parts.names, rows, strict=True)}
+    sets = dict(zip(obj.parts.names, states[0].split(obj.parts.counts), strict=True))
     sets |= {f"state_{state}": splats for state, splats in enumerate(states)}
     return [_write(splats, folder / f"{name}.ply") for name, splats in sets.items()]
 

@@ -101,11 +101,8 @@ def _require_usd() -> None:
 
 def _splats_of_links(obj: ArticulatedObject, mechanism: Mechanism, scale: float) -> list[Splats]:
     """The splats of each part in its link's frame, metres."""
-    placed = obj.parts.place(obj.parts.boxes, 0.0)
-    rows = torch.arange(len(placed)).split(obj.parts.counts)
     pieces = []
-    for link, row in zip(mechanism.links, rows, strict=True):
-        piece = placed[row]
+    for link, piece in zip(mechanism.links, obj.parts.place(obj.parts.boxes, 0.0).split(obj.parts.counts), strict=True):
         origin = torch.as_tensor(link.origin, dtype=piece.means.dtype)
         pieces.append(replace(piece, means=piece.means * scale - origin, log_scales=piece.log_scales + math.log(scale)))
     return pieces

@@ -1,6 +1,6 @@
 """3D Gaussian splats in one frame."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -64,6 +64,11 @@ class Splats:
     def __getitem__(self, index: slice | Tensor) -> "Splats":
         """The splats that an index, a mask or a slice selects."""
         return Splats(**{name: value[index] for name, value in self.tensors().items()})
+
+    def split(self, counts: Sequence[int]) -> "list[Splats]":
+        """Consecutive sets of so many splats each, such as those of each part."""
+        rows = torch.arange(len(self), device=self.means.device).split(list(counts))
+        return [self[row] for row in rows]
 
     @staticmethod
     def concatenate(items: Iterable["Splats"]) -> "Splats":
