@@ -38,6 +38,7 @@ from structuregs.boxes.hypotheses import (
     turn_about,
 )
 from structuregs.boxes.judge import Scene, Trial, refine, simplest
+from structuregs.boxes.partition import Division, Found, undivided
 from structuregs.boxes.pieces import Pieces
 from structuregs.boxes.review import PartReview
 from structuregs.capture import Capture, TrueJoint
@@ -620,6 +621,36 @@ class TestDivide:
     def test_what_no_factor_suits_is_left_whole(self):
         points, means, _ = self.boards()
         assert len(divide(points, means, np.full((len(FACTORS), len(means)), -1.0), 1.6, 0.0, CueConfig(), voxel=0.05)) == 1
+
+
+class TestUndivided:
+    """Cluster 3 stood for one part and was divided into 5 and 6, and 6 into 7 and 8."""
+
+    @staticmethod
+    def clusters(whole: float, five: float, seven: float, eight: float, six: float = 0.4, elsewhere: int = -1) -> set[int]:
+        """Which clusters stand for a part in the end, given what each explained; 2 is another part."""
+        part = MovingPart(
+            0, (np.zeros((1, 3)),), Hypothesis(SE3.identity(dtype=F64), outside=0.0, unexplained=0.0, oddity=0.0), 0.1, 1.0, ()
+        )
+        found = {2: Found(part, 0.1), 5: Found(part, five), 7: Found(part, seven), 8: Found(part, eight)}
+        divisions = [Division(3, Found(part, whole), [5, 6]), Division(6, Found(part, six), [7, 8])]
+        return set(undivided({i: one for i, one in found.items() if one.worth}, divisions, {elsewhere}))
+
+    def test_pieces_that_explain_more_than_the_whole_stay(self):
+        assert self.clusters(whole=0.8, five=0.4, seven=0.3, eight=0.2) == {2, 5, 7, 8}
+
+    def test_a_whole_that_explained_more_than_its_pieces_is_one_part_again(self):
+        assert self.clusters(whole=1.0, five=0.4, seven=0.3, eight=0.2) == {2, 5, 7, 8}, "hardly more"
+        assert self.clusters(whole=1.2, five=0.4, seven=0.3, eight=0.2) == {2, 3}
+
+    def test_a_piece_may_be_whole_again_by_itself(self):
+        assert self.clusters(whole=0.7, five=0.4, seven=0.1, eight=0.2) == {2, 5, 6}
+
+    def test_of_a_piece_that_became_no_part_nothing_counts(self):
+        assert self.clusters(whole=0.7, five=0.0, seven=0.3, eight=0.2) == {2, 3}
+
+    def test_a_piece_that_belongs_to_another_part_keeps_its_cluster_divided(self):
+        assert self.clusters(whole=0.7, five=0.0, seven=0.3, eight=0.2, elsewhere=5) == {2, 7, 8}
 
 
 class TestCutAcross:

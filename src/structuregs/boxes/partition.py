@@ -1,8 +1,8 @@
 """From clusters of what moved to moving parts: each a box in state 0 and the motion that the photos like best."""
 
 import itertools
-from collections.abc import Generator
-from dataclasses import replace
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -25,6 +25,45 @@ from .hypotheses import (
 from .judge import NOISE, Scene, Trial, measured
 from .pieces import MovingPart, Pieces
 from .review import PartReview
+
+_TORN = 0.8  # of what a cluster explained as one part: several that explain less together are that part, torn to pieces
+
+
+@dataclass(frozen=True)
+class Found:
+    """A part, and what it explains of both states' photos, less what speaks against its motion, in mean error."""
+
+    part: MovingPart
+    worth: float
+
+
+@dataclass(frozen=True)
+class Division:
+    """A cluster taken for several parts: what it was as one, and the indices of the clusters in its place."""
+
+    index: int
+    whole: Found
+    pieces: list[int]
+
+
+def undivided(found: dict[int, Found], divisions: Sequence[Division], elsewhere: set[int]) -> dict[int, Found]:
+    """What was found, by clusters; one that explained clearly more as a whole than its pieces do is one part again.
+
+    Args:
+        found: by the index of its cluster.
+        divisions: in the order in which they were made; a piece may have been divided in its turn.
+        elsewhere: clusters that turned out to belong to parts found as others; what holds one of them stays divided.
+    """
+    found = dict(found)
+    ends: dict[int, list[int]] = {}  # of clusters that were divided: what became of them
+    for division in reversed(divisions):
+        pieces = [end for index in division.pieces for end in ends.get(index, [index])]
+        worth = sum(found[index].worth for index in pieces if index in found)
+        if worth < _TORN * division.whole.worth and elsewhere.isdisjoint(pieces):
+            found = {index: one for index, one in found.items() if index not in pieces}
+            found[division.index], pieces = division.whole, [division.index]
+        ends[division.index] = pieces
+    return found
 
 
 class PartSearch:
@@ -100,7 +139,8 @@ class PartSearch:
 
     def _found(self) -> Generator[int, None, list[MovingPart]]:
         """The parts as they are found, one after the other."""
-        parts: list[MovingPart] = []
+        found: dict[int, Found] = {}
+        divisions: list[Division] = []
         explained: set[int] = set()
         refused: dict[int, tuple[int, float]] = {}
         count = len(self.pieces)
@@ -110,6 +150,7 @@ class PartSearch:
         while todo:
             index = todo.pop(0)
             yield min(index, count)
+            parts = [one.part for one in found.values()]
             if index in waiting:
                 waiting.remove(index)
                 todo = self._left_of(index, parts) + todo
@@ -129,7 +170,9 @@ class PartSearch:
                 continue
             if len(several) > 1:
                 explained |= members
-                todo = self._replaced(min(members), several) + todo
+                new = self._replaced(min(members), several)
+                divisions.append(Division(index, Found(part, -trial.cost(part.hypothesis)), new))
+                todo = new + todo
                 continue
             share = len(part.points) / len(self.pieces.looks[part.state].points)
             large = share > self.config.large
@@ -138,9 +181,9 @@ class PartSearch:
                     refused[index] = (part.state, share)
                 continue
             explained |= members | self.pieces.explained_by(part)
-            parts.append(part)
+            found[index] = Found(part, -trial.cost(part.hypothesis))
         self.left_over = [what for index, what in refused.items() if index not in explained]
-        return parts
+        return [one.part for one in undivided(found, divisions, explained - found.keys()).values()]
 
     def _is_open(self, state: int, todo: set[int]) -> bool:
         return any(self.pieces.clusters[index].state == state for index in todo)
