@@ -46,20 +46,21 @@ class Division:
     pieces: list[int]
 
 
-def undivided(found: dict[int, Found], divisions: Sequence[Division], elsewhere: set[int]) -> dict[int, Found]:
+def undivided(found: dict[int, Found], divisions: Sequence[Division], explained: set[int]) -> dict[int, Found]:
     """What was found, by clusters; one that explained clearly more as a whole than its pieces do is one part again.
 
     Args:
         found: by the index of its cluster.
         divisions: in the order in which they were made; a piece may have been divided in its turn.
-        elsewhere: clusters that turned out to belong to parts found as others; what holds one of them stays divided.
+        explained: clusters that belong to a part; a piece among them that is no part belongs to another's, and the cluster
+            that held it stays divided.
     """
     found = dict(found)
     ends: dict[int, list[int]] = {}  # of clusters that were divided: what became of them
     for division in reversed(divisions):
         pieces = [end for index in division.pieces for end in ends.get(index, [index])]
         worth = sum(found[index].worth for index in pieces if index in found)
-        if worth < _TORN * division.whole.worth and elsewhere.isdisjoint(pieces):
+        if worth < _TORN * division.whole.worth and explained.isdisjoint(set(pieces) - found.keys()):
             found = {index: one for index, one in found.items() if index not in pieces}
             found[division.index], pieces = division.whole, [division.index]
         ends[division.index] = pieces
@@ -158,6 +159,7 @@ class PartSearch:
             if index in explained:
                 continue
             part, members, trial = self._try(index, parts, explained)
+            one = Found(part, -trial.cost(part.hypothesis))
             several = self._divided(part, trial, index in self.pieces.apart) if part.gain > NOISE else [part.points]
             doubtful = len(several) > 1 or trial.explained(part.hypothesis) < self.config.clear_case * trial.most
             if doubtful and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
@@ -171,7 +173,7 @@ class PartSearch:
             if len(several) > 1:
                 explained |= members
                 new = self._replaced(min(members), several)
-                divisions.append(Division(index, Found(part, -trial.cost(part.hypothesis)), new))
+                divisions.append(Division(index, one, new))
                 todo = new + todo
                 continue
             share = len(part.points) / len(self.pieces.looks[part.state].points)
@@ -181,9 +183,9 @@ class PartSearch:
                     refused[index] = (part.state, share)
                 continue
             explained |= members | self.pieces.explained_by(part)
-            found[index] = Found(part, -trial.cost(part.hypothesis))
+            found[index] = one
         self.left_over = [what for index, what in refused.items() if index not in explained]
-        return [one.part for one in undivided(found, divisions, explained - found.keys()).values()]
+        return [one.part for one in undivided(found, divisions, explained).values()]
 
     def _is_open(self, state: int, todo: set[int]) -> bool:
         return any(self.pieces.clusters[index].state == state for index in todo)
