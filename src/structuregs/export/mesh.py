@@ -1,5 +1,6 @@
 """A clean surface for each part, from its splats as the photos' cameras see them; and files of it."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from .tsdf import Volume
 _SIZE = 600  # side of the images that depth is rendered in, pixels
 _VOXELS = 250  # along the object's longest side
 _TRUNCATION = 3.0  # voxels; more would close gaps and swallow thin boards
+_RIM = 5  # voxels along the sides of a box where unseen space is closed off; deeper in, sight ends in the air
 _FEWEST = 0.025  # share of the views that must have looked at a place before a surface is drawn there
 _SPECK = 0.01  # pieces below this share of a part's largest piece are noise; a handle is larger
 _EMPTY = 64  # of 255: where a photo's mask is below this, its ray meets nothing
@@ -32,9 +34,10 @@ _BATCH = 16  # views that are fused at once
 def part_meshes(obj: ArticulatedObject, capture: Capture, *, voxel: float | None = None) -> list[trimesh.Trimesh]:
     """The surface of each part, in the parts' order, with vertex colours.
 
-    Median depth, rendered part by part from the training cameras of both states, is fused in the frame of the part's box.
+    Depth, rendered part by part from the training cameras of both states, is fused in the frame of the part's box.
     A part counts where it is in front of all others; where another part is in front, or the photo's mask is empty, the ray
-    says how far space is empty.  What no photo saw stays open, and nothing stands beyond the box and a small margin.
+    says how far space is empty.  What no photo saw stays open, but for a rim along the sides of the box, where what the part
+    itself hides is closed: what stands on the ground has an underside.  Nothing stands beyond the box and a small margin.
 
     Args:
         obj: whose parts.
@@ -115,7 +118,7 @@ def _volume(half_extents: Float64[np.ndarray, " 3"], voxel: float) -> Volume:
 
 
 def _mesh(volume: Volume, box: Box, fewest: float) -> trimesh.Trimesh:
-    vertices, faces, rgb = volume.surface(fewest)
+    vertices, faces, rgb = volume.surface(fewest, outside=math.ceil(_TRUNCATION), rim=_RIM)
     if not len(faces):
         return trimesh.Trimesh()  # with no colours: trimesh cannot copy colours of no vertices
     world = box.T_world_box.to(dtype=torch.float64).apply(torch.from_numpy(vertices)).numpy()

@@ -1,10 +1,10 @@
 """Draws splats: a differentiable renderer with several back ends, and the losses on its images."""
 
 from .image_loss import image_loss
-from .median import Surface, render_surface
 from .planes import PlaneImage, render_planes
 from .records import Projection, Render
-from .render import blend, painted_share, project, render
+from .render import blend, painted, painted_share, project, render
+from .surface import Surface, render_surface
 
 __all__ = [
     "PlaneImage",
@@ -13,6 +13,7 @@ __all__ = [
     "Surface",
     "blend",
     "image_loss",
+    "painted",
     "painted_share",
     "project",
     "render",

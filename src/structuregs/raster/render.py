@@ -50,6 +50,17 @@ def painted_share(splats: Splats, chosen: Bool[Tensor, " N"], camera: Camera) ->
     return float(render(replace(splats, sh=sh), camera, background=black).rgb.mean())
 
 
+def painted(splats: Splats, camera: Camera) -> Float[Tensor, " N"]:
+    """The share of the image that each splat paints, where others may stand before it; they add up to the mean alpha."""
+    with torch.no_grad():
+        projection = project(splats, camera)
+    with torch.enable_grad():
+        rgb = projection.rgb.clone().requires_grad_()
+        picture = blend(replace(projection, rgb=rgb), camera.width, camera.height, splats.means.new_zeros(3))
+        (weights,) = torch.autograd.grad(picture.rgb[..., 0].mean(), rgb)
+    return weights[:, 0]
+
+
 def stages(tensor: Tensor):
     """The back end for a tensor like this, as a module."""
     fast = tensor.device.type if tensor.dtype == torch.float32 else ""

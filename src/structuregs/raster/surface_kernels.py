@@ -1,4 +1,4 @@
-"""Median depth in Numba."""
+"""The depth of splats' surface in Numba."""
 
 import math
 
@@ -10,14 +10,15 @@ from .blend_kernels import TILE
 from .records import MAX_ALPHA, MIN_ALPHA
 
 _MAX_ALPHA, _MIN_ALPHA = np.float32(MAX_ALPHA), np.float32(MIN_ALPHA)
-_ZERO, _ONE, _HALF, _TWO = np.float32(0), np.float32(1), np.float32(0.5), np.float32(2)
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+_LEFT = np.float32(0.4)  # of a pixel's light at the surface
 _LOWEST = np.float32(math.log2(MIN_ALPHA) - 0.01)
 _TINY = np.float32(1e-6)
 
 
 @kernel(parallel=True)
-def median_forward(starts, splats, drawing, planes, lanes, depth, image):
-    """Fills depth (H W), 0 where half of the light comes through, and image (H W 3), the mean colour up to there.
+def surface_forward(starts, splats, drawing, planes, lanes, depth, image):
+    """Fills depth (H W), 0 where more than `_LEFT` of the light comes through, and image (H W 3), the mean colour up to there.
 
     starts, splats: tile lists; drawing: see `pack`; planes (N 3): change of a splat's depth per pixel to the right and
     down, and its deviation; lanes: threads, over which neighbouring tiles are dealt out.
@@ -51,10 +52,10 @@ def _pixel(col, row, first, past, splats, drawing, planes, depth, image):
         r += weight * s[6]
         g += weight * s[7]
         b += weight * s[8]
-        if through - weight < _HALF:
-            # The share of this splat that brings the light down to half is reached before its middle.
+        if through - weight < _LEFT:
+            # The share of this splat that brings the light down so far is reached before its middle.
             plane = planes[splats[k]]
-            early = np.float32(math.sqrt(_TWO * np.float32(math.log(weight / max(through - _HALF, _TINY)))))
+            early = np.float32(math.sqrt(_TWO * np.float32(math.log(weight / max(through - _LEFT, _TINY)))))
             depth[row, col] = s[9] - plane[0] * dx - plane[1] * dy - plane[2] * early
             through -= weight
             break
