@@ -734,6 +734,20 @@ class TestBoxesOfParts:
         still = torch.cat([item.box.corners for item in obj.parts[0].boxes]).float()
         assert boxes[0].contains(still, margin=2 * voxel).all()
 
+    @pytest.mark.parametrize(("gap", "reached"), [(0.05, True), (0.3, False)])
+    def test_reach_as_far_as_the_hinge_where_it_is_near(self, gap: float, reached: bool):
+        """Points of a door 1 wide whose hinge is `gap` beside them: hulls do not show there that it moved."""
+        _, looks = looks_of("laptop")
+        g = np.random.default_rng(0)
+        points = g.uniform([0, -0.02, 0], [1, 0.02, 0.8], (2000, 3))
+        hinge = Screw("revolute", torch.tensor([0.0, 0, 1]).double(), torch.tensor([-gap, 0.0, 0]).double())
+        found = MovingPart(0, (points,), Hypothesis(hinge.motion(1.0), 0.0, 0.0, 0.0), 0.5, 0.1)
+        box = boxes_of_parts(looks, [found], SMALL)[0][1]
+        assert bool(box.contains(torch.tensor([-gap, 0.0, 0.4]), margin=1e-3)) == reached
+        low = box.corners.amin(0)[0]
+        grown = SMALL.margin * looks[0].hull.voxel
+        assert low == pytest.approx(min(-gap, -grown) if reached else -grown, abs=0.02)
+
     def test_what_few_masks_leave_in_the_air_is_not_the_base_s(self):
         _, looks = looks_of("laptop")
         clean = boxes_of_parts(looks, parts_of("laptop"), SMALL)[0]

@@ -1,16 +1,17 @@
 """A closed box of splats, and a ball that slides out of it: which photos show the ball, and what follows."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from structuregs.capture import Capture
-from structuregs.fit.evidence import seen_in_both
+from structuregs.capture import Capture, stack_views
+from structuregs.fit.evidence import seen_in_both, shown
 from structuregs.geometry import SE3, Box
 from structuregs.joints import articulate
 from structuregs.model import ArticulatedObject, PosedParts, Splats
-from structuregs.raster import painted_share, render
+from structuregs.raster import painted, painted_share, render
 from structuregs.synthetic import RenderOptions, make_capture, make_object
 
 
@@ -81,3 +82,29 @@ def test_painted_shares_add_up_to_the_picture_s_coverage(capture: Capture):
     some = torch.arange(len(splats)) % 3 == 0
     total = painted_share(splats, some, camera) + painted_share(splats, ~some, camera)
     assert total == pytest.approx(float(render(splats, camera).alpha.mean()), abs=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_what_each_splat_paints_is_what_it_takes_part_in(capture: Capture, backend: str):
+    """Held against pictures in which some splats are white and all others black."""
+    splats = hidden_ball(out=0.7).parts.at_state(1)
+    if backend == "reference":
+        splats = Splats(**{name: value.double() for name, value in splats.tensors().items()})
+    camera = capture.train[0][0].camera
+    each = painted(splats, camera)
+    assert not each.requires_grad
+    for some in (torch.arange(len(splats)) % 3 == 0, torch.arange(len(splats)) > len(splats) - 200):
+        assert float(each[some].sum()) == pytest.approx(painted_share(splats, some, camera), abs=2e-5)
+
+
+def test_what_no_photo_shows_is_told_from_what_some_do(capture: Capture):
+    photos = [stack_views(views, 64) for views in capture.train]
+    seen = []
+    for way in (0.0, 0.7):
+        parts = hidden_ball(out=way).parts
+        parts.splats.log_scales[: parts.counts[0]] = math.log(0.06)  # no light between the blobs of the box
+        seen.append(shown(parts, photos).split(parts.counts))
+    (shell, shut), (_, out) = seen
+    assert shell.float().mean() > 0.9
+    assert not shut.any()
+    assert out.float().mean() > 0.4

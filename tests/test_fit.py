@@ -9,7 +9,7 @@ from torch import Tensor
 
 from door_and_drawer import DOOR, DRAWER, made_of, photographed
 from structuregs.capture import stack_views
-from structuregs.fit.boxes import squared_up, tightened
+from structuregs.fit.boxes import base_tightened, squared_up, tightened
 from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
 from structuregs.fit.loop import FitState, Fitter, askew
@@ -169,6 +169,23 @@ class TestDensification:
         for name in SPLAT_NAMES:
             torch.testing.assert_close(after.leaves[name], variables.leaves[name][source])
 
+    def test_pruning_takes_what_sticks_out_of_the_base_into_a_moving_box(self):
+        """The door's box reaches from (.2, -.1, .1) to (1, .1, .5), the base's to .5 on all sides."""
+        variables = Variables.of(DOOR_AND_DRAWER)
+        with torch.no_grad():
+            variables.leaves["means"].clamp_(-0.9, 0.9)
+            places = torch.tensor([[0.55, 0, 0.3], [0.45, 0, 0.3], [0.55, 0, -0.2], [0.55, 0.115, 0.3], [0.55, 0.13, 0.3]])
+            variables.leaves["means"][:5] = places / 0.5
+            variables.leaves["means"][120] = torch.tensor([1.1, 0, 0])
+        _, source, _ = self.grown(variables, None)
+        assert sorted(set(range(360)) - set(source.tolist())) == [0, 3]
+
+    def test_what_no_photo_shows_goes(self):
+        shown = torch.arange(360) % 5 > 0
+        after, source, _ = grow(self.variables(slice(0, 0)), None, self.growth, self.size, torch.Generator(), shown)
+        assert sorted(source.tolist()) == shown.nonzero()[:, 0].tolist()
+        assert after.counts == (96, 96, 96)
+
     def test_small_splats_are_cloned_and_large_ones_split(self):
         large = torch.zeros(360, dtype=torch.bool)
         large[100:140] = True
@@ -254,6 +271,34 @@ QUICK = FitConfig(
 CONSTANT = Rates(means_final=1.0, poses_final=1.0, appearance_final=1.0)
 # The preset without stages in which some rates wait for others.
 PLAIN = replace(PRESETS["paper"], image_from=0, structure_size=24, one_joint_from=1.0)
+
+
+class TestLastStep:
+    def test_takes_what_hangs_unseen_behind_the_rest(self):
+        """All photos are taken from below: what lies on top of an opaque base is hidden in both states."""
+        g = torch.Generator().manual_seed(1)
+        floor, hidden = torch.rand(600, 3, generator=g) * 2 - 1, torch.rand(50, 3, generator=g) - 0.5
+        floor[:, 2], hidden[:, 2] = -1, 0.9
+        base = DOOR_AND_DRAWER.part_splats(0)
+        rows = base[torch.zeros(650, dtype=torch.long)]
+        splats = replace(rows, means=torch.cat([floor, hidden]), logit_opacities=torch.full((650,), 6.0))
+        splats = replace(splats, log_scales=torch.full((650, 3), math.log(0.04)))
+        parts = replace(
+            DOOR_AND_DRAWER,
+            splats=Splats.concatenate([splats, DOOR_AND_DRAWER.splats[torch.arange(120, 360)]]),
+            counts=(650, 120, 120),
+            tint=torch.zeros(890, 3),
+        )
+        fit = fitter(
+            replace(QUICK, steps=6, image_from=1, structure_until=1, loose_until=1, growth=Growth(interval=100)), parts
+        )
+        list(fit.run(5))
+        assert fit.state.variables.counts[0] == 650
+        list(fit.run(6))
+        heights = fit.state.variables.parts().part_splats(0).means[:, 2]
+        assert (heights > 0).sum() < 5
+        assert (heights < 0).sum() > 400
+        assert len(fit.state.moments["means"][0]) == sum(fit.state.variables.counts)
 
 
 class TestOptimiser:
@@ -531,6 +576,15 @@ class TestResult:
         assert opaque.abs().max() < 1.1
         assert ((opaque.abs() > 0.95).sum(0) >= 6).all(), "every face is reached, in each of three parts"
         assert (tight.boxes.half_extents < 0.55 * loose.boxes.half_extents).all()
+
+    def test_the_base_s_box_alone_is_made_tight(self):
+        parts = turned_parts()
+        shrunk = replace(parts, splats=replace(parts.splats, means=0.5 * parts.splats.means))
+        tight = base_tightened(shrunk)
+        torch.testing.assert_close(tight.boxes.half_extents[0], tightened(shrunk).boxes.half_extents[0])
+        torch.testing.assert_close(tight.boxes.half_extents[1:], shrunk.boxes.half_extents[1:])
+        for state in (0, 1):
+            same_splats(tight.at_state(state), shrunk.at_state(state))
 
     def test_boxes_are_turned_along_the_faces_of_their_splats(self):
         """Splats on the faces of the boxes; each box is then put askew, and comes back."""

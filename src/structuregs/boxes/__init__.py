@@ -2,7 +2,7 @@
 
 from .config import SearchConfig
 from .cue import Cluster, CueConfig, StateLook, box_around, clusters
-from .fill import seeded, strewn
+from .fill import in_moving_box, seeded, strewn
 from .partition import PartSearch
 from .pieces import MovingPart
 from .survey import StartConfig, boxes_at_rest, boxes_of_parts, find_parts, look_at_states, survey
@@ -20,6 +20,7 @@ __all__ = [
     "boxes_of_parts",
     "clusters",
     "find_parts",
+    "in_moving_box",
     "look_at_states",
     "seeded",
     "strewn",

@@ -86,18 +86,18 @@ def seeded(
     pieces[0] = _doubted(pieces[0], boxes, motions)
     faint = strewn(boxes, motions, per_part, sh_degree, generator, looks[0].splats.base_rgb.mean(0), reach)
     extra = [faint.part_splats(k) for k in range(len(sources))]
-    extra[0] = extra[0][~_in_moving_box(boxes[0].to_world(extra[0].means), boxes, motions)]
+    extra[0] = extra[0][~in_moving_box(boxes[0].to_world(extra[0].means), boxes, motions)]
     counts = tuple(len(piece) + len(more) for piece, more in zip(pieces, extra, strict=True))
     rows = [splats for pair in zip(pieces, extra, strict=True) for splats in pair]
     return PosedParts(boxes, motions, Splats.concatenate(rows), counts, torch.zeros(sum(counts), 3))
 
 
-def _in_moving_box(points: Float[Tensor, "N 3"], boxes: Box, motions: SE3) -> Bool[Tensor, " N"]:
-    """Whether world points lie in a moving box, in either state."""
-    inside = torch.zeros(len(points), dtype=torch.bool)
+def in_moving_box(points: Float[Tensor, "N 3"], boxes: Box, motions: SE3, margin: float = 0.0) -> Bool[Tensor, " N"]:
+    """Whether world points lie in a moving box grown by `margin` (world units) on every side, in either state."""
+    inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for posed in (boxes, boxes.moved(motions)):
         for k in range(1, len(boxes.half_extents)):
-            inside |= posed[k].contains(points)
+            inside |= posed[k].contains(points, margin)
     return inside
 
 
@@ -107,7 +107,7 @@ def _doubted(base: Splats, boxes: Box, motions: SE3) -> Splats:
     A look at one state cannot tell what hangs in a place that hardly any view sees into, such as the opening of a cabinet;
     what it leaves there would hide the part that belongs there in the other state.
     """
-    doubtful = _in_moving_box(boxes[0].to_world(base.means), boxes, motions)
+    doubtful = in_moving_box(boxes[0].to_world(base.means), boxes, motions)
     faint = torch.where(doubtful, base.logit_opacities.clamp(max=FAINT), base.logit_opacities)
     return replace(base, logit_opacities=faint)
 

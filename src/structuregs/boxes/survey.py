@@ -9,13 +9,16 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from ..capture import Capture, stack_views
-from ..geometry import SE3, Box
+from ..geometry import SE3, Box, screw_at
+from ..joints import kind_of
 from ..points import Clouds, Silhouettes, object_bounds
 from .appearance import AppearanceConfig, fit_state, surface_points
 from .config import SearchConfig
 from .cue import StateLook, base_axes, box_around, clusters, held_by_hull
 from .partition import PartSearch
 from .pieces import MovingPart
+
+_HINGE = 0.5  # of a box's half extents: a hinge so far outside the box may still be its part's
 
 
 @dataclass(frozen=True)
@@ -68,10 +71,25 @@ def _grown(points: Float64[np.ndarray, "P 3"], by: float, axes: Float64[Tensor, 
 def boxes_of_parts(looks: tuple[StateLook, StateLook], parts: list[MovingPart], config: StartConfig) -> tuple[Box, SE3]:
     """Boxes in state 0 and motions (K of each, float32, the base first) of the parts that a search found."""
     by = config.margin * looks[0].hull.voxel
-    moving = [_grown(part.points_in(0), by) for part in parts]
+    moving = [_to_hinge(_grown(part.points_in(0), by), part.motion) for part in parts]
     posed = [(box, box.moved(part.motion)) for box, part in zip(moving, parts, strict=True)]
     still = _grown(_still_points(looks, posed), by, base_axes(looks))
     return _stacked([still, *moving], [SE3.identity(dtype=torch.float64), *(part.motion for part in parts)])
+
+
+def _to_hinge(box: Box, motion: SE3) -> Box:
+    """The box, drawn out to the hinge that its part turns about, where that is near.
+
+    Beside its hinge a part stands where it stood in the other state, and hulls cannot tell it from what is still.
+    """
+    if kind_of(motion) == "prismatic":
+        return box
+    screw, _ = screw_at(motion, "revolute", box.T_world_box.xyz)
+    hinge = box.T_world_box.inverse().apply(screw.origin)
+    if not (hinge.abs() < (1 + _HINGE) * box.half_extents).all():
+        return box
+    low, high = torch.minimum(hinge, -box.half_extents), torch.maximum(hinge, box.half_extents)
+    return Box(SE3.from_quat(box.T_world_box.wxyz, box.T_world_box.apply((low + high) / 2)), (high - low) / 2)
 
 
 def _still_points(looks: tuple[StateLook, StateLook], moving: list[tuple[Box, Box]]) -> Float64[np.ndarray, "P 3"]:

@@ -25,6 +25,11 @@ def tightened(parts: PosedParts) -> PosedParts:
     return parts
 
 
+def base_tightened(parts: PosedParts) -> PosedParts:
+    """The same with the base's box alone made to reach just as far as its opaque splats do."""
+    return parts.in_box(0, _tight(parts, 0))
+
+
 def squared_up(parts: PosedParts) -> PosedParts:
     """The same splats in boxes of the same size and place, turned along the parts' faces, as opaque splats show them."""
     parts = parts.detach()

@@ -6,12 +6,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..boxes import in_moving_box
 from ..geometry import quat_to_matrix
 from ..raster import Projection
 from .schedule import Growth
 from .variables import SPLAT_NAMES, Variables, part_index
 
 _CELLS = 256  # along each side of a box, in which splats are put in order
+_BESIDE = 0.02  # of the object's size: so near a moving box the base does not stick out of its own
 _SHRINK = 1.6  # the halves of a split splat are this much smaller (Kerbl et al. 2023)
 
 
@@ -60,11 +62,24 @@ def _moved_within(
 
 @torch.no_grad()
 def prune_mask(variables: Variables, growth: Growth, size: float) -> Bool[Tensor, " N"]:
-    """Splats to keep: neither faded nor far out of their box; size: of the object, world units."""
-    leaves = variables.leaves
+    """Splats to keep: neither faded nor far out of their box, nor the base's beside a moving part.
+
+    Next to its hinge a part is where it was in both states, so the base could paint it as well: what sticks out of the base's
+    box into a moving one goes, and the part's own splats grow there.
+
+    Args:
+        variables: with the splats.
+        growth: thresholds.
+        size: of the object, world units.
+    """
+    leaves, boxes = variables.leaves, variables.boxes()
     opaque = torch.sigmoid(leaves["logit_opacities"]) > growth.faint
     reach = 1 + growth.reach * size * (-leaves["log_half_extents"]).exp()
-    return opaque & (leaves["means"].abs() < reach[part_index(variables.counts, opaque.device)]).all(-1)
+    near = (leaves["means"].abs() < reach[part_index(variables.counts, opaque.device)]).all(-1)
+    base = leaves["means"][: variables.counts[0]]
+    out = (base.abs() > 1).any(-1)
+    near[: len(base)] &= ~(out & in_moving_box(boxes[0].to_world(base), boxes, variables.motions(), _BESIDE * size))
+    return opaque & near
 
 
 def _along_curve(means: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
@@ -82,7 +97,12 @@ def _along_curve(means: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
 
 @torch.no_grad()
 def grow(
-    variables: Variables, gradients: ScreenGradients | None, growth: Growth, size: float, generator: torch.Generator
+    variables: Variables,
+    gradients: ScreenGradients | None,
+    growth: Growth,
+    size: float,
+    generator: torch.Generator,
+    shown: Bool[Tensor, " N"] | None = None,
 ) -> tuple[Variables, Int[Tensor, " M"], Bool[Tensor, " M"]]:
     """One round: prunes, and where gradients are given clones small splats and splits large ones.
 
@@ -92,6 +112,7 @@ def grow(
         growth: thresholds.
         size: of the object, world units.
         generator: for the places of the halves.
+        shown: splats that some photo shows, the others go; None: all stay.
 
     Returns:
         Variables after, each part's splats in the order of a curve through its box; for each splat the index of the one it
@@ -99,6 +120,8 @@ def grow(
     """
     count = sum(variables.counts)
     keep = prune_mask(variables, growth, size)
+    if shown is not None:
+        keep &= shown
     device = keep.device
     clone = split = torch.zeros(count, dtype=torch.bool, device=device)
     if gradients is not None:

@@ -17,9 +17,10 @@ from ..geometry import SE3, JointKind
 from ..joints import kind_of
 from ..model import PosedParts, Splats
 from ..raster import image_loss, render
-from .boxes import object_size, squared_up
+from .boxes import base_tightened, object_size, squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
+from .evidence import shown
 from .merge import idle_part, moving_alike
 from .schedule import FitConfig
 from .structure import StructureWeights, structure_loss
@@ -157,9 +158,9 @@ class Fitter:
 
     @torch.no_grad()
     def _square_up(self) -> None:
-        """Turns boxes along the faces of their parts: joints are drawn to the axes of the base's."""
+        """Turns boxes along the faces of their parts: joints are drawn to the axes of the base's, which is also made tight."""
         leaves = self.state.variables.leaves
-        for name, value in Variables.of(squared_up(self.state.variables.parts())).leaves.items():
+        for name, value in Variables.of(base_tightened(squared_up(self.state.variables.parts()))).leaves.items():
             if name != "motions":
                 leaves[name].copy_(value)
 
@@ -297,20 +298,22 @@ class Fitter:
             leaf.grad = None
 
     def _densify(self) -> None:
-        """A round of densification or of pruning, where the schedule asks for one."""
-        config, growth, step = self.config, self.config.growth, self.state.step
-        if step < config.image_from or (step + 1) % growth.interval or step + 1 >= config.steps:
+        """A round of densification or of pruning, where the schedule asks for one; after the last step the unseen go."""
+        config, growth, done = self.config, self.config.growth, self.state.step + 1
+        last = done == config.steps
+        if done <= config.image_from or (done % growth.interval and not last):
             return
-        growing = growth.first * config.steps <= step < growth.last * config.steps
-        noise = torch.Generator().manual_seed(int(np.random.default_rng((self.seed, step)).integers(2**62)))
+        growing = growth.first * config.steps < done <= growth.last * config.steps and not last
+        seen = shown(self.state.variables.parts(), self._images()) if last else None
+        noise = torch.Generator().manual_seed(int(np.random.default_rng((self.seed, done - 1)).integers(2**62)))
         gradients = self.state.gradients if growing else None
-        self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.state.size, noise)
+        self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.state.size, noise, seen)
         for name in SPLAT_NAMES:
             first, second = (moment[source] for moment in self.state.moments[name])
             first[fresh], second[fresh] = 0, 0
             self.state.moments[name] = (first, second)
         self.state.gradients = ScreenGradients.zeros(len(source), self.device)
-        if growing and growth.reset and (step + 1) % growth.reset == 0:
+        if growing and growth.reset and done % growth.reset == 0:
             with torch.no_grad():
                 self.state.variables.leaves["logit_opacities"].clamp_(max=float(np.log(0.01 / 0.99)))
 
