@@ -71,8 +71,9 @@ def _grown(points: Float64[np.ndarray, "P 3"], by: float, axes: Float64[Tensor, 
 def boxes_of_parts(looks: tuple[StateLook, StateLook], parts: list[MovingPart], config: StartConfig) -> tuple[Box, SE3]:
     """Boxes in state 0 and motions (K of each, float32, the base first) of the parts that a search found."""
     by = config.margin * looks[0].hull.voxel
-    moving = [_to_hinge(_grown(part.points_in(0), by), part.motion) for part in parts]
-    posed = [(box, box.moved(part.motion)) for box, part in zip(moving, parts, strict=True)]
+    moving = [_grown(part.points_in(0), by) for part in parts]
+    drawn = [_to_hinge(box, part.motion) for box, part in zip(moving, parts, strict=True)]
+    posed = [(box, box.moved(part.motion)) for box, part in zip(drawn, parts, strict=True)]
     still = _grown(_still_points(looks, posed), by, base_axes(looks))
     return _stacked([still, *moving], [SE3.identity(dtype=torch.float64), *(part.motion for part in parts)])
 
@@ -80,7 +81,8 @@ def boxes_of_parts(looks: tuple[StateLook, StateLook], parts: list[MovingPart], 
 def _to_hinge(box: Box, motion: SE3) -> Box:
     """The box, drawn out to the hinge that its part turns about, where that is near.
 
-    Beside its hinge a part stands where it stood in the other state, and hulls cannot tell it from what is still.
+    Beside its hinge a part stands where it stood in the other state, and hulls cannot tell it from what is still: the base's
+    box need not hold it.  The part's own box does not reach there either, or it would take the frame with it.
     """
     if kind_of(motion) == "prismatic":
         return box
