@@ -90,8 +90,7 @@ def _to_hinge(box: Box, motion: SE3) -> Box:
     hinge = box.T_world_box.inverse().apply(screw.origin)
     if not (hinge.abs() < (1 + _HINGE) * box.half_extents).all():
         return box
-    low, high = torch.minimum(hinge, -box.half_extents), torch.maximum(hinge, box.half_extents)
-    return Box(SE3.from_quat(box.T_world_box.wxyz, box.T_world_box.apply((low + high) / 2)), (high - low) / 2)
+    return Box.around(torch.cat([box.corners, screw.origin[None]]), box.T_world_box.rotation)
 
 
 def _still_points(looks: tuple[StateLook, StateLook], moving: list[tuple[Box, Box]]) -> Float64[np.ndarray, "P 3"]:

@@ -54,12 +54,11 @@ def seen_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject:
         capture: what it was fitted to.
     """
     shares = torch.zeros(2, len(obj.parts))
-    owners = torch.repeat_interleave(torch.arange(len(obj.parts)), torch.tensor(obj.parts.counts))
     for state, views in enumerate(capture.train):
         stack, splats = stack_views(views, _SIZE), obj.parts.at_state(state)
         cameras = [stack.cameras[v] for v in spread_cameras(stack.cameras, _PHOTOS)]
         for camera in cameras:
-            shares[state].index_add_(0, owners, painted(splats, camera).cpu() / len(cameras))
+            shares[state].index_add_(0, obj.parts.part, painted(splats, camera).cpu() / len(cameras))
     joints = [_weighed(joint, shares[:, k].tolist()) for k, joint in enumerate(obj.joints, start=1)]
     return replace(obj, joints=tuple(joints))
 

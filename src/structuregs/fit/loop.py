@@ -305,7 +305,7 @@ class Fitter:
             return
         growing = growth.first * config.steps < done <= growth.last * config.steps and not last
         seen = shown(self.state.variables.parts(), self._images()) if last else None
-        noise = torch.Generator().manual_seed(int(np.random.default_rng((self.seed, done - 1)).integers(2**62)))
+        noise = torch.Generator().manual_seed(int(np.random.default_rng((self.seed, self.state.step)).integers(2**62)))
         gradients = self.state.gradients if growing else None
         self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.state.size, noise, seen)
         for name in SPLAT_NAMES:
