@@ -301,6 +301,18 @@ class TestLastStep:
         assert len(fit.state.moments["means"][0]) == sum(fit.state.variables.counts)
 
 
+def test_the_share_of_ssim_changes_when_its_time_has_come():
+    """Two fits whose shares differ from the half on are one until then."""
+    always, later = (fitter(replace(QUICK, ssim_weights=((0.0, 0.1), *rest))) for rest in ((), ((0.5, 0.9),)))
+    colours = []
+    for steps in (20, 21):
+        for fit in (always, later):
+            list(fit.run(steps))
+        colours.append([fit.state.variables.leaves["sh"].detach().clone() for fit in (always, later)])
+    assert torch.equal(*colours[0])
+    assert not torch.equal(*colours[1])
+
+
 class TestOptimiser:
     def test_is_adam(self):
         """The same random gradients through `torch.optim.Adam`; a motion's are of one size, so that sharing it is no matter."""
@@ -671,4 +683,4 @@ def test_the_paper_s_preset_has_the_supplement_s_numbers():
     paper = PRESETS["paper"]
     assert (paper.steps, paper.splats_per_part, paper.image_from, paper.loose_until) == (10_000, 10_000, 400, 1500)
     assert (paper.rates.means, paper.rates.boxes, paper.rates.motions) == (1.6e-2, 1e-2, 1e-2)
-    assert (paper.image_weight, paper.ssim_weight, paper.hypotheses) == (10.0, 0.2, False)
+    assert (paper.image_weight, paper.ssim_weights, paper.hypotheses) == (10.0, ((0.0, 0.2),), False)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from pickle import UnpicklingError
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from .variables import SPLAT_NAMES, Variables
 
 _REPORT_EVERY = 10
 _SQUARE_WITHIN = float(np.sin(np.deg2rad(10))) ** 2
+_Value = TypeVar("_Value")
 _BOX_NAMES = ("box_quats", "box_centres", "log_half_extents")
 # What torch raises over a file that was cut short or is something else, and what reading another record raises.
 _DAMAGED = (RuntimeError, EOFError, OSError, UnpicklingError, AttributeError, KeyError, TypeError, ValueError)
@@ -183,9 +185,13 @@ class Fitter:
         turn, place = divmod(self.state.step, count)
         return int(_order(self.seed, state, turn, count)[place])
 
+    def _in_force(self, schedule: Sequence[tuple[float, _Value]]) -> _Value:
+        """What a schedule of (part of the fit, value) says for this step."""
+        return [value for start, value in schedule if self.state.step >= start * self.config.steps][-1]
+
     def _images(self) -> list[ImageStack]:
         """Both states' images in the size that this step works at."""
-        size = [size for start, size in self.config.sizes if self.state.step >= start * self.config.steps][-1]
+        size = self._in_force(self.config.sizes)
         if self.stacks[0] != size:
             self.stacks = (size, [stack_views(views, size) for views in self.capture.train])
         return self.stacks[1]
@@ -233,6 +239,7 @@ class Fitter:
         growing = self.state.step < config.growth.last * config.steps
         posed = [parts.at_state(s) for s in (0, 1)]
         loss = self._priors(parts, posed)
+        ssim_weight = self._in_force(config.ssim_weights)
         renders, squares = [], []
         for s, stack in enumerate(self._images()):
             v = self._view(s, len(stack))
@@ -242,7 +249,7 @@ class Fitter:
                 picture.projection.xy.retain_grad()
                 renders.append((picture, max(picture.alpha.shape) / config.image_weight))
             loss = loss + config.image_weight * image_loss(
-                picture.rgb, picture.alpha, rgb, alpha, ssim_weight=config.ssim_weight, alpha_weight=config.alpha_weight
+                picture.rgb, picture.alpha, rgb, alpha, ssim_weight=ssim_weight, alpha_weight=config.alpha_weight
             )
             if (self.state.step + 1) % _REPORT_EVERY == 0:
                 squares.append(float((picture.rgb.detach() - rgb).square().mean()))
