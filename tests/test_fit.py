@@ -388,14 +388,21 @@ class TestOptimiser:
                 before - leaf.detach(), torch.full_like(leaf, rate * final ** (step / 10)), atol=1e-6, rtol=1e-3
             )
 
+    def test_motions_wait_for_the_splats(self):
+        fit = fitter(replace(QUICK, motions_from=0.5))
+        start = fit.state.variables.motions().wxyz_xyz.detach().clone()
+        list(fit.run(20))
+        assert torch.equal(fit.state.variables.motions().wxyz_xyz, start)
+        list(fit.run(21))
+        assert not torch.equal(fit.state.variables.motions().wxyz_xyz, start)
+
     def test_a_fit_to_its_own_pictures_brings_a_wrong_motion_back(self):
         off = SE3.exp(torch.tensor([[0.0] * 6, [0.02, -0.02, 0.01, 0.0, 0.03, -0.06], [0.0] * 6]))
         parts = replace(DOOR_AND_DRAWER, motions=off @ DOOR_AND_DRAWER.motions)
         still = Rates(*[0.0] * 7, motions=1e-2)
         growth = Growth(interval=1000)
-        config = replace(
-            QUICK, steps=150, image_from=0, structure_until=0, one_joint_from=1.0, rates=still, growth=growth, alpha_weight=0.0
-        )
+        now = replace(QUICK, image_from=0, structure_until=0, motions_from=0.0)
+        config = replace(now, steps=150, one_joint_from=1.0, rates=still, growth=growth, alpha_weight=0.0)
         fit = fitter(config, parts)
         list(fit.run(150))
         found = fit.state.variables.motions()[1]

@@ -24,7 +24,11 @@ def ablations(capture: Capture, config: FitConfig, folder: Path, seed: int) -> l
         "steady_poses": ("rates of poses that do not fall", replace(config, rates=replace(config.rates, poses_final=1.0))),
         "half_size": ("photos of half the size", replace(config, sizes=tuple((at, size // 2) for at, size in config.sizes))),
         "full_size": ("photos of the last size from the start", replace(config, sizes=((0.0, last),))),
-        "boxes_pull": ("losses on boxes move the motions too", replace(config, motions_with_structure=True)),
+        "eager_motions": ("motions move as soon as photos are compared", replace(config, motions_from=0.0)),
+        "boxes_pull": (
+            "losses on boxes move the motions too",
+            replace(config, motions_with_structure=True, motions_from=0.0),
+        ),
         "no_search": ("no search: motions start at rest", replace(config, hypotheses=False)),
     }
     return [Setting("default", "as it is", config), *(Setting(name, *row) for name, row in rows.items())]

@@ -280,7 +280,7 @@ class Fitter:
         done = max(0, self.state.step - config.image_from) / max(1, config.steps - config.image_from)
         if name in _BOX_NAMES:  # without the losses on boxes only splats and motions have something to explain
             return rates.boxes * rates.poses_final**done if self.state.step < config.structure_until else 0.0
-        if name == "motions" and self.state.step < config.image_from and not config.motions_with_structure:
+        if name == "motions" and self.state.step < config.motions_from * config.steps:
             return 0.0
         final = {"means": rates.means_final, "motions": rates.poses_final}.get(name, rates.appearance_final)
         return getattr(rates, name) * final**done

@@ -80,6 +80,9 @@ class FitConfig:
     """Step at which the image loss begins."""
     structure_size: int = 96
     """Size of the structure images: the side of a square with as many pixels."""
+    motions_from: float = 0.2
+    """Part of the fit after which motions move.  While splats still fill their boxes, which are wider than their parts, what
+    sticks out of a part where photos see it pushes it aside, and splats that settle afterwards keep it there."""
     motions_with_structure: bool = False
     """Whether the losses on boxes move the motions too."""
     sizes: tuple[tuple[float, int], ...] = ((0.0, 160), (0.35, 256), (0.65, 400), (0.92, 800))
@@ -138,6 +141,7 @@ PRESETS: dict[str, FitConfig] = {
         structure_until=10_000,
         loose_until=1500,
         image_from=400,
+        motions_from=0.0,
         motions_with_structure=True,
         sizes=((0.0, 1600),),
         ssim_weights=((0.0, 0.2),),
