@@ -84,7 +84,7 @@ class FitConfig:
     """Part of the fit after which motions move.  While splats still fill their boxes, which are wider than their parts, what
     sticks out of a part where photos see it pushes it aside, and splats that settle afterwards keep it there."""
     motions_with_structure: bool = False
-    """Whether the losses on boxes move the motions too."""
+    """Whether the losses on boxes move the motions too, from `motions_from` on."""
     sizes: tuple[tuple[float, int], ...] = ((0.0, 160), (0.35, 256), (0.65, 400), (0.92, 800))
     """(part of the fit, size) from which on images have that size, cropped to the object; never more than they have."""
     image_weight: float = 10.0
