@@ -14,7 +14,8 @@ from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
 from structuregs.fit.loop import FitState, Fitter, askew
 from structuregs.fit.merge import idle_part, moving_alike
-from structuregs.fit.reconstruct import RunFolder, choose_device, finished_object
+from structuregs.fit.reconstruct import choose_device, finished_object
+from structuregs.fit.run import RunFolder
 from structuregs.fit.schedule import PRESETS, FitConfig, Growth, Rates
 from structuregs.fit.variables import SPLAT_NAMES, Variables, part_index
 from structuregs.geometry import SE3, Box, Screw, quat_to_matrix

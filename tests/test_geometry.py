@@ -216,3 +216,22 @@ def test_projection_of_a_hand_made_camera():
     half, _ = view.resized(50, 40).project(torch.tensor([[0.2, 0.1, 2.0]]))
     assert half[0].tolist() == pytest.approx([30, 22.5])
     assert torch.equal(view.K @ torch.tensor([0.0, 0, 1]), torch.tensor([50.0, 40, 1]))
+
+
+def test_a_turned_camera_stays_where_it_is_and_looks_elsewhere():
+    """Turned to the right (about y, down) by an angle: what lay there at infinity is on the axis now."""
+    view, angle = camera(), 0.3
+    turned = view.turned(torch.tensor([0.0, angle, 0.0]))
+    assert torch.equal(turned.centre, view.centre)
+    R = view.T_world_camera.rotation
+    aside = R @ torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
+    pixels, _ = turned.project(view.centre + 1000 * aside)
+    assert pixels.tolist() == pytest.approx([view.cx, view.cy], abs=0.02)
+
+
+def test_directions_are_the_rays_in_the_camera_s_frame():
+    view = camera()
+    _, rays = view.rays()
+    torch.testing.assert_close(view.directions() @ view.T_world_camera.rotation.T, rays)
+    pixel = torch.tensor([[view.cx + view.fx, view.cy - 2 * view.fy]])
+    torch.testing.assert_close(view.directions(pixel), torch.tensor([[1.0, -2.0, 1.0]]))

@@ -19,6 +19,7 @@ from structuregs.capture import Capture, TrueJoint, load_capture
 from structuregs.fit.events import Finished, FitEvent, Note, StageStarted, Step
 from structuregs.fit.loop import FitState
 from structuregs.fit.reconstruct import fit_run, reconstruct
+from structuregs.fit.run import RunFolder
 from structuregs.fit.schedule import FitConfig, Growth
 from structuregs.geometry import SE3
 from structuregs.model import ArticulatedObject, Joint, load_object
@@ -41,6 +42,7 @@ TINY = FitConfig(
     ),
     growth=Growth(interval=30, most=3000),
 )
+AIMING = replace(TINY, steps=100, aim_at=0.3)  # when so few steps have made a picture
 RESULTS = ("object/splats.safetensors", "object/object.json", "metrics.jsonl")
 
 
@@ -121,6 +123,61 @@ class TestObjects:
         assert Note("0 moving parts found") in events
         assert len(load_object(tmp_path / "run" / "object").parts) == 1
         assert (tmp_path / "run" / "notes.txt").read_text().startswith("1 were asked for: ")
+
+
+@pytest.fixture(scope="module")
+def straight() -> Capture:
+    return photographed("slider")
+
+
+@pytest.fixture(scope="module")
+def astray(straight: Capture) -> Capture:
+    """The slider by cameras each of which is said to point a degree elsewhere than it did."""
+    ways = torch.nn.functional.normalize(torch.randn(2, 12, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    return straight.turned(list(math.radians(1.0) * ways))
+
+
+@pytest.fixture(scope="module")
+def put_right(astray: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[FitEvent]]:
+    """A run of it, and what it reported."""
+    run = tmp_path_factory.mktemp("runs") / "astray"
+    events = []
+    for event in fit_run(astray, run, AIMING, device="cpu"):
+        if event == StageStarted("look", 2) and event in events:
+            shutil.copytree(run, run.with_name("stopped"))
+        events.append(event)
+    return run, events
+
+
+class TestCamerasAstray:
+    def test_parts_are_searched_for_again_with_cameras_put_right(
+        self, put_right: tuple[Path, list[FitEvent]], astray: Capture, straight: Capture
+    ):
+        folder, events = put_right
+        stages = [event.stage for event in events if isinstance(event, StageStarted)]
+        assert stages == ["look", "search", "fit"] * 2
+        (true,) = make_object("slider").joints
+        (joint,) = finished(events).joints
+        assert joint.kind == "prismatic"
+        assert axis_angle_deg(joint, true) < 2
+        assert "and were turned" in (folder / "notes.txt").read_text()
+
+        def beside_deg(capture: Capture) -> float:
+            """Median angle between the cameras' true sight and theirs, over both states."""
+            pairs = zip(sum(capture.train, ()), sum(straight.train, ()), strict=True)
+            sights = [[view.camera.T_world_camera.rotation[:, 2] for view in pair] for pair in pairs]
+            return math.degrees(float(torch.tensor([float((a @ b).clamp(max=1).acos()) for a, b in sights]).median()))
+
+        assert beside_deg(astray) > 0.7
+        assert beside_deg(RunFolder(folder).turned(astray)) < 0.4
+
+    def test_what_stops_in_the_second_search_goes_on_to_the_same_end(
+        self, put_right: tuple[Path, list[FitEvent]], astray: Capture
+    ):
+        stopped = put_right[0].with_name("stopped")
+        events = list(fit_run(astray, stopped, AIMING, device="cpu"))
+        assert events[0] == Note("going on from step 40")
+        assert results(stopped) == results(put_right[0])
 
 
 class TestEvents:

@@ -296,6 +296,7 @@ def _fit(
     from .capture import load_capture
     from .export import write_report, write_structure
     from .fit.reconstruct import fit_run
+    from .fit.run import RunFolder
     from .fit.schedule import PRESETS
 
     photos = load_capture(capture, views=views, seed=seed)
@@ -308,6 +309,7 @@ def _fit(
             page = stack.enter_context(LivePage(photos.name))
             print(f"look at {page.url}", flush=True)
         obj = _follow(events, page).obj
+        photos = RunFolder(run).turned(photos)
         write_structure(photos, obj, run / "overview.png")
         report = write_report(run, photos, obj)
     _print_joints(obj)

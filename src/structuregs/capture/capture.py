@@ -1,12 +1,14 @@
 """A capture in memory: posed, masked images of one object in two states."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float32, UInt8, UInt16
 from PIL import Image
+from torch import Tensor
 
 from ..geometry import Camera
 from .errors import CaptureError
@@ -91,6 +93,14 @@ class Capture:
     train: tuple[tuple[View, ...], tuple[View, ...]]
     test: tuple[tuple[View, ...], tuple[View, ...]]
     layout: str
+
+    def turned(self, turns: Sequence[Float32[Tensor, "_ 3"]]) -> "Capture":
+        """The capture with every training camera turned: rotation vectors of either state's (see `Camera.turned`)."""
+        first, second = (
+            tuple(replace(v, camera=v.camera.turned(turn)) for v, turn in zip(views, state, strict=True))
+            for views, state in zip(self.train, turns, strict=True)
+        )
+        return replace(self, train=(first, second))
 
 
 def _area_mean(image: UInt16[np.ndarray, "H W C"], width: int, height: int) -> Float32[np.ndarray, "h w C"]:

@@ -29,6 +29,10 @@ class ImageStack:
     rgb: UInt8[np.ndarray, "V H W 3"]
     alpha: UInt8[np.ndarray, "V H W"]
 
+    def turned(self, turns: Float32[Tensor, "V 3"]) -> "ImageStack":
+        """The same images, each camera turned (see `Camera.turned`)."""
+        return replace(self, cameras=tuple(c.turned(turn) for c, turn in zip(self.cameras, turns, strict=True)))
+
     def __len__(self) -> int:
         return len(self.cameras)
 

@@ -11,6 +11,7 @@ import trimesh
 from ..capture import Capture, Truth, find_truth, load_capture, load_truth
 from ..export.assets import replace_file
 from ..export.mesh import part_meshes
+from ..fit.run import RunFolder
 from ..model import ArticulatedObject, load_object
 from .images import psnr_on_views
 from .scores import JointScore, score_joints
@@ -162,13 +163,13 @@ def capture_of_run(run: Path) -> Path:
 
 
 def training_capture(run: Path) -> Capture:
-    """The capture that a run was fitted to, with the training views that the fit had.
+    """The capture that a run was fitted to, with the training views that the fit had and their cameras as it turned them.
 
     Raises:
-        ValueError: the run's configuration is missing or damaged.
+        ValueError: the run's configuration, or the record of its cameras, is missing or damaged.
     """
     folder, views, seed = _configuration(run, "capture", "views", "seed")
-    return load_capture(Path(folder), views=max(views), seed=seed)
+    return RunFolder(run).turned(load_capture(Path(folder), views=max(views), seed=seed))
 
 
 def _configuration(run: Path, *names: str) -> list[Any]:

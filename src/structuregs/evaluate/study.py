@@ -12,7 +12,8 @@ from ..export.overlay import draw_error_maps, draw_structure
 from ..export.page import image_bytes, plain_page, png_url
 from ..export.report import loss_points
 from ..fit.events import Finished, FitEvent, Preview, Step
-from ..fit.reconstruct import RunFolder, fit_run
+from ..fit.reconstruct import fit_run
+from ..fit.run import RunFolder
 from ..fit.schedule import FitConfig
 from ..model import ArticulatedObject, load_object
 from .ablation import ablations

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from ..capture import Capture, View, spread_cameras, stack_views
-from ..fit.reconstruct import RunFolder
+from ..fit.run import RunFolder
 from ..geometry import Camera
 from ..metrics import psnr
 from ..model import ArticulatedObject, Joint, Splats

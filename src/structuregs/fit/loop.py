@@ -14,10 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capture import Capture, ImageStack, stack_views
-from ..geometry import SE3, JointKind
+from ..geometry import SE3, Camera, JointKind
 from ..joints import kind_of
 from ..model import PosedParts, Splats
 from ..raster import image_loss, render
+from .aim import beside, misaim, with_coverage
 from .boxes import base_tightened, object_size, squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
@@ -29,6 +30,8 @@ from .surface import planarity_loss, thickness
 from .variables import SPLAT_NAMES, Variables
 
 _REPORT_EVERY = 10
+_BESIDE = 0.2  # pixels of the photos that steps work at: photos that lie farther beside have their cameras turned
+_AIM = 0.5  # of the way that a photo asks for: the other photos speak too
 _SQUARE_WITHIN = float(np.sin(np.deg2rad(10))) ** 2
 _Value = TypeVar("_Value")
 _BOX_NAMES = ("box_quats", "box_centres", "log_half_extents")
@@ -48,6 +51,8 @@ class FitState:
         free_motions: the K motions (wxyz_xyz) as they were when they were still free.
         size: of the object, about its radius, as the boxes had it before the first step; world units.
         step: steps done.
+        turns: by which the training cameras of either state were turned (see `Camera.turned`); None where they were right.
+        anew: whether the fit has begun with the cameras already turned.
     """
 
     variables: Variables
@@ -57,6 +62,8 @@ class FitState:
     free_motions: Tensor
     size: float
     step: int
+    turns: tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]] | None = None
+    anew: bool = False
 
     @staticmethod
     def start(parts: PosedParts) -> "FitState":
@@ -88,6 +95,8 @@ class FitState:
             "free_motions": self.free_motions,
             "size": self.size,
             "step": self.step,
+            "turns": self.turns,
+            "anew": self.anew,
         }
         staged = file.with_name(file.name + ".part")
         torch.save(record, staged)
@@ -106,7 +115,8 @@ class FitState:
             leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
             variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
             gradients = ScreenGradients(*r["gradients"])
-            return FitState(variables, r["moments"], r["taken"], gradients, r["free_motions"], r["size"], r["step"])
+            r = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "turns", "anew")}
+            return FitState(variables, gradients=gradients, **r)
         except _DAMAGED as error:
             raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
 
@@ -133,6 +143,8 @@ class Fitter:
         while self.state.step < min(steps, self.config.steps):
             if self.state.step == round(self.config.join_at * self.config.steps):
                 yield from self._merge_parts()
+            if self.state.step == round(self.config.aim_at * self.config.steps) and self.state.turns is None:
+                yield from self._aim_cameras()
             if self.state.step in [round(at * self.config.steps) for at in self.config.square_at]:
                 self._square_up()
             yield from self._settle_joints()
@@ -150,13 +162,23 @@ class Fitter:
                 parts = self.state.variables.parts().detach()
             pair, idle = moving_alike(parts), None
             if pair is None:
-                idle = idle_part(parts, self._images()[1])
+                idle = idle_part(parts, self._aimed_images()[1])
                 if idle is None:
                     return
                 pair = (0, idle)
-            self.state = replace(FitState.start(parts.joined(*pair)), size=self.state.size, step=step)
+            s = self.state
+            self.state = replace(FitState.start(parts.joined(*pair)), size=s.size, step=step, turns=s.turns, anew=s.anew)
             what = "a part that need not move is the base's" if idle else "two parts that move alike are one"
             yield Note(f"{what} from step {step} on; {len(parts) - 2} left")
+
+    def _aim_cameras(self) -> Iterator[FitEvent]:
+        """Has cameras turned from now on, where photos lie beside what they show of the parts."""
+        with torch.no_grad():
+            pixels = beside(self.state.variables.parts(), self._images())
+        if pixels > _BESIDE:
+            first, second = (torch.zeros(len(views), 3) for views in self.capture.train)
+            self.state.turns = (first, second)
+            yield Note(f"photos lie {pixels:.1f} pixels beside what their cameras show: cameras are turned from now on")
 
     @torch.no_grad()
     def _square_up(self) -> None:
@@ -196,6 +218,15 @@ class Fitter:
             self.stacks = (size, [stack_views(views, size) for views in self.capture.train])
         return self.stacks[1]
 
+    def _aimed_images(self) -> list[ImageStack]:
+        """`_images` with their cameras as they are turned by now."""
+        images = self._images()
+        return images if self.state.turns is None else [i.turned(t) for i, t in zip(images, self.state.turns, strict=True)]
+
+    def _camera(self, stack: ImageStack, state: int, v: int) -> Camera:
+        """The camera of a view as it is turned by now."""
+        return stack.cameras[v] if self.state.turns is None else stack.cameras[v].turned(self.state.turns[state][v])
+
     def _step(self) -> tuple[float, float | None]:
         """One step of the optimiser; its loss and the images' PSNR."""
         config, step, variables = self.config, self.state.step, self.state.variables
@@ -220,7 +251,7 @@ class Fitter:
 
     def _structure_loss(self, parts: PosedParts) -> Tensor:
         views = [self._view(s, len(stack)) for s, stack in enumerate(self.masks)]
-        cameras = (self.masks[0].cameras[views[0]], self.masks[1].cameras[views[1]])
+        cameras = (self._camera(self.masks[0], 0, views[0]), self._camera(self.masks[1], 1, views[1]))
         masks = [stack.target(v)[1].to(self.device) for stack, v in zip(self.masks, views, strict=True)]
         motions = parts.motions if self.config.motions_with_structure else SE3(parts.motions.wxyz_xyz.detach())
         loose = self.state.step < self.config.loose_until
@@ -244,7 +275,11 @@ class Fitter:
         for s, stack in enumerate(self._images()):
             v = self._view(s, len(stack))
             rgb, alpha = (image.to(self.device) for image in stack.target(v))
-            picture = render(posed[s], stack.cameras[v])
+            camera = self._camera(stack, s, v)
+            picture = render(posed[s], camera)
+            if self.state.turns is not None:
+                drawn, photo = with_coverage(picture.rgb, picture.alpha), with_coverage(rgb, alpha)
+                self.state.turns[s][v] += _AIM * misaim(drawn, photo, camera)
             if growing:
                 picture.projection.xy.retain_grad()
                 renders.append((picture, max(picture.alpha.shape) / config.image_weight))
@@ -271,7 +306,7 @@ class Fitter:
             for s, stack in enumerate(self.faces):
                 v = self._view(s, len(stack))
                 rgb, alpha = (image.to(self.device) for image in stack.target(v))
-                loss = loss + config.planarity_weight * planarity_loss(posed[s], stack.cameras[v], rgb, alpha)
+                loss = loss + config.planarity_weight * planarity_loss(posed[s], self._camera(stack, s, v), rgb, alpha)
         return loss
 
     def _rate(self, name: str) -> float:
@@ -311,7 +346,7 @@ class Fitter:
         if done <= config.image_from or (done % growth.interval and not last):
             return
         growing = growth.first * config.steps < done <= growth.last * config.steps and not last
-        seen = shown(self.state.variables.parts(), self._images()) if last else None
+        seen = shown(self.state.variables.parts(), self._aimed_images()) if last else None
         noise = torch.Generator().manual_seed(int(np.random.default_rng((self.seed, self.state.step)).integers(2**62)))
         gradients = self.state.gradients if growing else None
         self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.state.size, noise, seen)

@@ -1,16 +1,14 @@
 """From a capture to an articulated object: the whole way, in a run's folder that it can go on from."""
 
-import json
 import tempfile
-import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from copy import deepcopy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
+from torch import Tensor
 
 from ..boxes import MovingPart, PartSearch, boxes_at_rest, boxes_of_parts, look_at_states, seeded, strewn
 from ..capture import Capture
@@ -22,95 +20,12 @@ from .boxes import object_size, tightened
 from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
 from .evidence import seen_in_both
 from .loop import FitState, Fitter
+from .run import Clock, RunFolder, write_aside
 from .schedule import PRESETS, FitConfig
 
 _PREVIEW_EVERY = 50  # steps
-
-
-@dataclass(frozen=True)
-class RunFolder:
-    """The files of a run (docs/format.md)."""
-
-    root: Path
-
-    @property
-    def config(self) -> Path:
-        """The effective configuration."""
-        return self.root / "config.json"
-
-    @property
-    def checkpoint(self) -> Path:
-        """The last checkpoint."""
-        return self.root / "checkpoints" / "last.pt"
-
-    @property
-    def metrics(self) -> Path:
-        """Loss and PSNR, one JSON record a line."""
-        return self.root / "metrics.jsonl"
-
-    @property
-    def timing(self) -> Path:
-        """Seconds spent, over all sittings."""
-        return self.root / "timing.json"
-
-    @property
-    def notes(self) -> Path:
-        """What the fit said of its result, a sentence a line; not there where it said nothing."""
-        return self.root / "notes.txt"
-
-    @property
-    def object(self) -> Path:
-        """The folder of the articulated object."""
-        return self.root / "object"
-
-    def begin(self, record: dict) -> None:
-        """Writes the configuration of a new run, or holds an old run's against it.
-
-        Raises:
-            ValueError: the folder holds a run of another configuration, or something that is no run.
-        """
-        if not self.config.exists():
-            if self.root.exists() and any(p.name != "capture" for p in self.root.iterdir()):
-                raise ValueError(f"{self.root}: the folder is not empty and holds no run; choose another with -o.")
-            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            _write(self.config, json.dumps(record, indent=1) + "\n")
-            return
-        try:
-            before = json.loads(self.config.read_text())
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{self.config}: not a configuration ({error}); choose another folder with -o.") from error
-        if not isinstance(before, dict):
-            raise ValueError(f"{self.config}: not a configuration (no JSON object); choose another folder with -o.")
-        changed = [key for key in sorted(record.keys() | before.keys()) if _plain(record.get(key)) != before.get(key)]
-        if changed:
-            raise ValueError(
-                f"{self.root}: a run with another {', '.join(changed)} lies here; go on with the same or choose another folder."
-            )
-
-    def seconds(self) -> float:
-        """Seconds spent so far."""
-        return json.loads(self.timing.read_text())["total"] if self.timing.exists() else 0.0
-
-    def records(self) -> list[dict[str, Any]]:
-        """The records of `metrics`, step by step; none where it is not there."""
-        return [json.loads(line) for line in self.metrics.read_text().splitlines()] if self.metrics.exists() else []
-
-    def cut_metrics(self, step: int) -> None:
-        """Drops the records of steps after `step`, which a run that goes on will write again."""
-        if self.metrics.exists():
-            lines = [line for line in self.metrics.read_text().splitlines(keepends=True) if line.endswith("\n")]
-            _write(self.metrics, "".join(line for line in lines if json.loads(line)["step"] <= step))
-
-
-def _plain(value: object) -> object:
-    """A value as JSON gives it back."""
-    return json.loads(json.dumps(value))
-
-
-def _write(file: Path, text: str) -> None:
-    staged = file.with_name(file.name + ".part")
-    staged.write_text(text)
-    staged.replace(file)
+_ANEW = 0.35  # of the fit: by then cameras that are turned are nearly right, and all begins anew with them
+_Beginning = Generator[FitEvent, None, FitState]
 
 
 def choose_device(name: str) -> torch.device:
@@ -234,33 +149,64 @@ def fit_run(
         yield Finished(load_object(folder.object), run)
         return
     torch.set_num_threads(1)  # the renderer has the cores; small tensors only lose by being shared out
-    clock = _Clock(folder)
+    clock = Clock(folder)
+    begin = partial(_begin, folder=folder, config=config, device=chosen, parts=parts, points=points, seed=seed)
     if folder.checkpoint.exists():
         state = FitState.load(folder.checkpoint, chosen)
         folder.cut_metrics(state.step)
         yield Note(f"going on from step {state.step}")
     else:
-        begun = yield from _noted(start_parts(capture, config, parts=parts, points=points, seed=seed), folder)
-        state = FitState.start(begun.to(chosen))
-        state.save(folder.checkpoint)
+        state = yield from begin(capture)
         clock.save()
-    yield StageStarted("fit", config.steps)
     fitter = Fitter(capture, config, state, seed, chosen)
-    yield Preview(partial(unfinished_object, state))
-    while fitter.state.step < config.steps:
-        done = fitter.state.step
+    yield from _all_steps(fitter, folder, clock, begin)
+    if fitter.state.turns is not None:
+        folder.keep_turns(fitter.state.turns, capture)
+    obj = seen_in_both(finished_object(fitter.state), folder.turned(capture))
+    save_object(obj, folder.object)
+    clock.save()
+    yield Finished(obj, run)
+
+
+def _all_steps(fitter: Fitter, folder: RunFolder, clock: Clock, begin: Callable[..., _Beginning]) -> Iterator[FitEvent]:
+    """The steps that are left, with records and checkpoints; where cameras had to be turned, all begins anew with them."""
+    config = fitter.config
+    yield StageStarted("fit", config.steps)
+    yield Preview(partial(unfinished_object, fitter.state))
+    while (done := fitter.state.step) < config.steps:
+        if fitter.state.turns is not None and not fitter.state.anew and done >= _ANEW * config.steps:
+            yield Note("parts are searched for again, with the cameras as they are turned by now")
+            fitter.state = yield from begin(fitter.capture, turns=fitter.state.turns)
+            yield StageStarted("fit", config.steps)
+            continue
         for event in fitter.run(done - done % config.checkpoint_every + config.checkpoint_every):
             if isinstance(event, Step):
-                _append(folder.metrics, event)
+                folder.report(event)
             yield event
             if isinstance(event, Step) and event.step % _PREVIEW_EVERY == 0:
                 yield Preview(partial(unfinished_object, fitter.state))
         fitter.state.save(folder.checkpoint)
         clock.save()
-    obj = seen_in_both(finished_object(fitter.state), capture)
-    save_object(obj, folder.object)
-    clock.save()
-    yield Finished(obj, run)
+
+
+def _begin(
+    capture: Capture,
+    *,
+    folder: RunFolder,
+    config: FitConfig,
+    device: torch.device,
+    parts: int | None,
+    points: str,
+    seed: int,
+    turns: tuple[Tensor, Tensor] | None = None,
+) -> _Beginning:
+    """The state before the first step, which is also the run's checkpoint, the cameras turned if they have to be."""
+    photos = capture if turns is None else capture.turned(turns)
+    begun = yield from _noted(start_parts(photos, config, parts=parts, points=points, seed=seed), folder)
+    state = replace(FitState.start(begun.to(device)), turns=turns, anew=turns is not None)
+    folder.cut_metrics(0)
+    state.save(folder.checkpoint)
+    return state
 
 
 def _noted(events: Generator[FitEvent, None, PosedParts], folder: RunFolder) -> Generator[FitEvent, None, PosedParts]:
@@ -271,27 +217,11 @@ def _noted(events: Generator[FitEvent, None, PosedParts], folder: RunFolder) -> 
             event = next(events)
         except StopIteration as done:
             if notes:
-                _write(folder.notes, "".join(f"{note}\n" for note in notes))
+                write_aside(folder.notes, "".join(f"{note}\n" for note in notes))
             return done.value
         if isinstance(event, Note) and event.lasting:
             notes.append(event.text)
         yield event
-
-
-def _append(file: Path, step: Step) -> None:
-    with file.open("a") as out:
-        out.write(json.dumps({"step": step.step, "loss": step.loss, "psnr": step.psnr, "splats": step.splats}) + "\n")
-
-
-class _Clock:
-    """Adds this sitting's seconds to the run's."""
-
-    def __init__(self, folder: RunFolder):
-        self.file, self.before, self.began = folder.timing, folder.seconds(), time.monotonic()
-
-    def save(self) -> None:
-        """Writes the total so far."""
-        _write(self.file, json.dumps({"total": round(self.before + time.monotonic() - self.began, 2)}) + "\n")
 
 
 def reconstruct(

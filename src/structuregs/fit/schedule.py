@@ -83,6 +83,9 @@ class FitConfig:
     motions_from: float = 0.2
     """Part of the fit after which motions move.  While splats still fill their boxes, which are wider than their parts, what
     sticks out of a part where photos see it pushes it aside, and splats that settle afterwards keep it there."""
+    aim_at: float = 0.15
+    """Part of the fit at which photos that lie beside their cameras' pictures have the cameras turned, from then on; 1 for
+    never."""
     motions_with_structure: bool = False
     """Whether the losses on boxes move the motions too, from `motions_from` on."""
     sizes: tuple[tuple[float, int], ...] = ((0.0, 160), (0.35, 256), (0.65, 400), (0.92, 800))
@@ -142,6 +145,7 @@ PRESETS: dict[str, FitConfig] = {
         loose_until=1500,
         image_from=400,
         motions_from=0.0,
+        aim_at=1.0,
         motions_with_structure=True,
         sizes=((0.0, 1600),),
         ssim_weights=((0.0, 0.2),),

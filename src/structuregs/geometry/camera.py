@@ -1,6 +1,6 @@
 """Pinhole cameras."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -32,6 +32,11 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         return Camera(self.T_world_camera, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
+    def turned(self, turn: Float[Tensor, " 3"]) -> "Camera":
+        """The camera turned about its own centre by a rotation vector in its own frame, radians."""
+        pose = self.T_world_camera.wxyz_xyz
+        return replace(self, T_world_camera=self.T_world_camera @ SE3.exp(torch.cat([torch.zeros(3), turn]).to(pose)))
+
     @property
     def K(self) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix, pixels."""
@@ -54,9 +59,13 @@ class Camera:
 
         Directions have unit z in the camera's frame, so a ray's parameter is the depth along z.
         """
+        d = self.directions(pixels)
+        return self.centre, d @ self.T_world_camera.rotation.to(d.dtype).T
+
+    def directions(self, pixels: Float[Tensor, "*batch 2"] | None = None) -> Float[Tensor, "*batch 3"]:
+        """Of the rays through `pixels`, as in `rays`, in the camera's own frame."""
         if pixels is None:
             v, u = torch.meshgrid(torch.arange(self.height) + 0.5, torch.arange(self.width) + 0.5, indexing="ij")
             pixels = torch.stack([u, v], -1)
         x, y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
-        d = torch.stack([x, y, torch.ones_like(x)], -1)
-        return self.centre, d @ self.T_world_camera.rotation.to(d.dtype).T
+        return torch.stack([x, y, torch.ones_like(x)], -1)

@@ -1,0 +1,153 @@
+"""The folder of a run: its files, and what is read from them to go on."""
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..capture import Capture
+from .events import Step
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The files of a run (docs/format.md)."""
+
+    root: Path
+
+    @property
+    def config(self) -> Path:
+        """The effective configuration."""
+        return self.root / "config.json"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last checkpoint."""
+        return self.root / "checkpoints" / "last.pt"
+
+    @property
+    def metrics(self) -> Path:
+        """Loss and PSNR, one JSON record a line."""
+        return self.root / "metrics.jsonl"
+
+    @property
+    def timing(self) -> Path:
+        """Seconds spent, over all sittings."""
+        return self.root / "timing.json"
+
+    @property
+    def cameras(self) -> Path:
+        """By how much the cameras were turned; not there where they were right."""
+        return self.root / "cameras.json"
+
+    @property
+    def notes(self) -> Path:
+        """What the fit said of its result, a sentence a line; not there where it said nothing."""
+        return self.root / "notes.txt"
+
+    @property
+    def object(self) -> Path:
+        """The folder of the articulated object."""
+        return self.root / "object"
+
+    def begin(self, record: dict) -> None:
+        """Writes the configuration of a new run, or holds an old run's against it.
+
+        Raises:
+            ValueError: the folder holds a run of another configuration, or something that is no run.
+        """
+        if not self.config.exists():
+            if self.root.exists() and any(p.name != "capture" for p in self.root.iterdir()):
+                raise ValueError(f"{self.root}: the folder is not empty and holds no run; choose another with -o.")
+            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+            write_aside(self.config, json.dumps(record, indent=1) + "\n")
+            return
+        try:
+            before = json.loads(self.config.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{self.config}: not a configuration ({error}); choose another folder with -o.") from error
+        if not isinstance(before, dict):
+            raise ValueError(f"{self.config}: not a configuration (no JSON object); choose another folder with -o.")
+        changed = [key for key in sorted(record.keys() | before.keys()) if _plain(record.get(key)) != before.get(key)]
+        if changed:
+            raise ValueError(
+                f"{self.root}: a run with another {', '.join(changed)} lies here; go on with the same or choose another folder."
+            )
+
+    def seconds(self) -> float:
+        """Seconds spent so far."""
+        return json.loads(self.timing.read_text())["total"] if self.timing.exists() else 0.0
+
+    def turned(self, capture: Capture) -> Capture:
+        """The capture that the run was fitted to, its training cameras turned as the fit has turned them.
+
+        Raises:
+            ValueError: `cameras` is damaged, or of another capture.
+        """
+        if not self.cameras.exists():
+            return capture
+        try:
+            states = json.loads(self.cameras.read_text())["turns"]
+            turns = [
+                torch.tensor([states[s][view.name] for view in views]).reshape(len(views), 3)
+                for s, views in enumerate(capture.train)
+            ]
+        except (ValueError, KeyError, IndexError, TypeError, RuntimeError) as error:
+            raise ValueError(f"{self.cameras}: not the turns of this capture's cameras ({error!r}); fit again.") from error
+        return capture.turned(turns)
+
+    def keep_turns(self, turns: Sequence[Float[Tensor, "_ 3"]], capture: Capture) -> None:
+        """Writes `cameras`, and adds to `notes` how far they were off."""
+        states = [
+            {view.name: turn for view, turn in zip(views, state.tolist(), strict=True)}
+            for views, state in zip(capture.train, turns, strict=True)
+        ]
+        write_aside(self.cameras, json.dumps({"turns": states}, indent=1) + "\n")
+        degrees = float(torch.cat(list(turns)).norm(dim=-1).median().rad2deg())
+        note = f"cameras pointed {degrees:.2f} degrees beside their photos (median) and were turned"
+        notes = self.notes.read_text().splitlines() if self.notes.exists() else []
+        write_aside(self.notes, "".join(f"{line}\n" for line in dict.fromkeys([*notes, note])))
+
+    def records(self) -> list[dict[str, Any]]:
+        """The records of `metrics`, step by step; none where it is not there."""
+        return [json.loads(line) for line in self.metrics.read_text().splitlines()] if self.metrics.exists() else []
+
+    def report(self, step: Step) -> None:
+        """Adds a record to `metrics`."""
+        with self.metrics.open("a") as out:
+            out.write(json.dumps({"step": step.step, "loss": step.loss, "psnr": step.psnr, "splats": step.splats}) + "\n")
+
+    def cut_metrics(self, step: int) -> None:
+        """Drops the records of steps after `step`, which a run that goes on will write again."""
+        if self.metrics.exists():
+            lines = [line for line in self.metrics.read_text().splitlines(keepends=True) if line.endswith("\n")]
+            write_aside(self.metrics, "".join(line for line in lines if json.loads(line)["step"] <= step))
+
+
+def _plain(value: object) -> object:
+    """A value as JSON gives it back."""
+    return json.loads(json.dumps(value))
+
+
+def write_aside(file: Path, text: str) -> None:
+    """Writes a file aside and renames it into place."""
+    staged = file.with_name(file.name + ".part")
+    staged.write_text(text)
+    staged.replace(file)
+
+
+class Clock:
+    """Adds this sitting's seconds to the run's."""
+
+    def __init__(self, folder: RunFolder):
+        self.file, self.before, self.began = folder.timing, folder.seconds(), time.monotonic()
+
+    def save(self) -> None:
+        """Writes the total so far."""
+        write_aside(self.file, json.dumps({"total": round(self.before + time.monotonic() - self.began, 2)}) + "\n")
