@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -685,6 +686,23 @@ class TestRunFolder:
         assert choose_device("auto") == torch.device("cpu")
         with pytest.raises(ValueError, match=r"^--device cuda: torch finds no GPU here; use --device cpu"):
             choose_device("cuda")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"structure_until": 3}, "structure_until 3 lies before image_from 4: no loss is on in between."),
+        (
+            {"motions_with_structure": True},
+            "motions_with_structure: the losses on boxes end at step 4, before motions move (from step 8 on); give a lower"
+            " motions_from.",
+        ),
+    ],
+)
+def test_a_configuration_in_which_something_would_do_nothing_is_refused(change: dict[str, int], sentence: str):
+    with pytest.raises(ValueError, match=rf"^{re.escape(sentence)}$"):
+        replace(QUICK, **change)  # pyright: ignore[reportArgumentType]
+    assert replace(QUICK, motions_with_structure=True, motions_from=0.05).motions_with_structure
 
 
 def test_the_paper_s_preset_has_the_supplement_s_numbers():

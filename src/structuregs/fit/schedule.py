@@ -132,6 +132,11 @@ class FitConfig:
             raise ValueError(
                 f"structure_until {self.structure_until} lies before image_from {self.image_from}: no loss is on in between."
             )
+        if self.motions_with_structure and self.motions_from * self.steps >= self.structure_until:
+            raise ValueError(
+                f"motions_with_structure: the losses on boxes end at step {self.structure_until}, before motions move (from"
+                f" step {self.motions_from * self.steps:g} on); give a lower motions_from."
+            )
 
 
 PRESETS: dict[str, FitConfig] = {
