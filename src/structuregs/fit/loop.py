@@ -143,7 +143,8 @@ class Fitter:
         while self.state.step < min(steps, self.config.steps):
             if self.state.step == round(self.config.join_at * self.config.steps):
                 yield from self._merge_parts()
-            if self.state.step == round(self.config.aim_at * self.config.steps) and self.state.turns is None:
+            aiming = max(round(self.config.aim_at * self.config.steps), self.config.image_from + 1)
+            if self.state.step == aiming and self.state.turns is None:
                 yield from self._aim_cameras()
             if self.state.step in [round(at * self.config.steps) for at in self.config.square_at]:
                 self._square_up()

@@ -84,8 +84,8 @@ class FitConfig:
     """Part of the fit after which motions move.  While splats still fill their boxes, which are wider than their parts, what
     sticks out of a part where photos see it pushes it aside, and splats that settle afterwards keep it there."""
     aim_at: float = 0.15
-    """Part of the fit at which photos that lie beside their cameras' pictures have the cameras turned, from then on; 1 for
-    never."""
+    """Part of the fit at which, once photos are compared, those that lie beside their cameras' pictures have the cameras
+    turned, from then on; 1 for never."""
     motions_with_structure: bool = False
     """Whether the losses on boxes move the motions too, from `motions_from` on."""
     sizes: tuple[tuple[float, int], ...] = ((0.0, 160), (0.35, 256), (0.65, 400), (0.92, 800))
