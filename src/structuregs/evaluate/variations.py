@@ -12,7 +12,6 @@ from scipy import ndimage
 from ..boxes import clusters, survey
 from ..capture import Capture, View
 from ..fit.schedule import FitConfig
-from ..geometry import SE3
 from .ablation import without_tint
 from .setting import Setting
 
@@ -88,8 +87,7 @@ def _astray(capture: Capture, seed: int) -> Capture:
 
     def change(view: View) -> View:
         axis = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
-        turn = SE3.exp(torch.cat([torch.zeros(3), np.deg2rad(_ASTRAY_DEG) * axis]))
-        return replace(view, camera=replace(view.camera, T_world_camera=view.camera.T_world_camera @ turn))
+        return replace(view, camera=view.camera.turned(np.deg2rad(_ASTRAY_DEG) * axis))
 
     return _each(capture, change)
 

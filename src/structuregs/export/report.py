@@ -47,10 +47,9 @@ def write_report(run: Path, capture: Capture, obj: ArticulatedObject, *, views: 
     folder = RunFolder(run)
     metrics = folder.records()
     seconds = folder.seconds()
-    notes = folder.notes.read_text().splitlines() if folder.notes.exists() else []
     opening = opening_camera(obj, _SWEEP_SIZE)
     sections = [
-        _warnings(obj, capture, notes),
+        _warnings(obj, capture, folder.sentences()),
         _section("Joints", _joint_table(obj.joints) + _structure(run, capture, obj)),
         _section("Photos and renderings", _comparison(capture, obj, opening, views)),
         _section("The fit", _timing(metrics, seconds) + _curves(metrics)) if metrics else "",

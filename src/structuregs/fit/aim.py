@@ -65,7 +65,8 @@ def beside(parts: PosedParts, photos: Sequence[ImageStack]) -> float:
     for state, stack in enumerate(photos):
         splats = parts.at_state(state)
         for v in spread_cameras(stack.cameras, _PHOTOS):
-            picture, camera = render(splats, stack.cameras[v]), stack.cameras[v]
+            camera = stack.cameras[v]
+            picture = render(splats, camera)
             turn = misaim(with_coverage(picture.rgb, picture.alpha), with_coverage(*stack.target(v)), camera)
             shifts.append(float(turn[:2].norm()) * camera.fx)
     return float(np.median(shifts))

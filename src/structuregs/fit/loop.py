@@ -115,8 +115,8 @@ class FitState:
             leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
             variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
             gradients = ScreenGradients(*r["gradients"])
-            r = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "turns", "anew")}
-            return FitState(variables, gradients=gradients, **r)
+            rest = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "turns", "anew")}
+            return FitState(variables, gradients=gradients, **rest)
         except _DAMAGED as error:
             raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
 

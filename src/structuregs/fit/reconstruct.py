@@ -20,7 +20,7 @@ from .boxes import object_size, tightened
 from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
 from .evidence import seen_in_both
 from .loop import FitState, Fitter
-from .run import Clock, RunFolder, write_aside
+from .run import Clock, RunFolder
 from .schedule import PRESETS, FitConfig
 
 _PREVIEW_EVERY = 50  # steps
@@ -217,7 +217,7 @@ def _noted(events: Generator[FitEvent, None, PosedParts], folder: RunFolder) -> 
             event = next(events)
         except StopIteration as done:
             if notes:
-                write_aside(folder.notes, "".join(f"{note}\n" for note in notes))
+                folder.keep_sentences(notes)
             return done.value
         if isinstance(event, Note) and event.lasting:
             notes.append(event.text)

@@ -66,7 +66,7 @@ class RunFolder:
             if self.root.exists() and any(p.name != "capture" for p in self.root.iterdir()):
                 raise ValueError(f"{self.root}: the folder is not empty and holds no run; choose another with -o.")
             self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            write_aside(self.config, json.dumps(record, indent=1) + "\n")
+            _write(self.config, json.dumps(record, indent=1) + "\n")
             return
         try:
             before = json.loads(self.config.read_text())
@@ -108,11 +108,18 @@ class RunFolder:
             {view.name: turn for view, turn in zip(views, state.tolist(), strict=True)}
             for views, state in zip(capture.train, turns, strict=True)
         ]
-        write_aside(self.cameras, json.dumps({"turns": states}, indent=1) + "\n")
+        _write(self.cameras, json.dumps({"turns": states}, indent=1) + "\n")
         degrees = float(torch.cat(list(turns)).norm(dim=-1).median().rad2deg())
         note = f"cameras pointed {degrees:.2f} degrees beside their photos (median) and were turned"
-        notes = self.notes.read_text().splitlines() if self.notes.exists() else []
-        write_aside(self.notes, "".join(f"{line}\n" for line in dict.fromkeys([*notes, note])))
+        self.keep_sentences(list(dict.fromkeys([*self.sentences(), note])))
+
+    def sentences(self) -> list[str]:
+        """The sentences of `notes`; none where it is not there."""
+        return self.notes.read_text().splitlines() if self.notes.exists() else []
+
+    def keep_sentences(self, sentences: Sequence[str]) -> None:
+        """Writes `notes`."""
+        _write(self.notes, "".join(f"{sentence}\n" for sentence in sentences))
 
     def records(self) -> list[dict[str, Any]]:
         """The records of `metrics`, step by step; none where it is not there."""
@@ -127,7 +134,7 @@ class RunFolder:
         """Drops the records of steps after `step`, which a run that goes on will write again."""
         if self.metrics.exists():
             lines = [line for line in self.metrics.read_text().splitlines(keepends=True) if line.endswith("\n")]
-            write_aside(self.metrics, "".join(line for line in lines if json.loads(line)["step"] <= step))
+            _write(self.metrics, "".join(line for line in lines if json.loads(line)["step"] <= step))
 
 
 def _plain(value: object) -> object:
@@ -135,7 +142,7 @@ def _plain(value: object) -> object:
     return json.loads(json.dumps(value))
 
 
-def write_aside(file: Path, text: str) -> None:
+def _write(file: Path, text: str) -> None:
     """Writes a file aside and renames it into place."""
     staged = file.with_name(file.name + ".part")
     staged.write_text(text)
@@ -150,4 +157,4 @@ class Clock:
 
     def save(self) -> None:
         """Writes the total so far."""
-        write_aside(self.file, json.dumps({"total": round(self.before + time.monotonic() - self.began, 2)}) + "\n")
+        _write(self.file, json.dumps({"total": round(self.before + time.monotonic() - self.began, 2)}) + "\n")
