@@ -11,7 +11,7 @@ from structuregs.fit.evidence import seen_in_both, shown
 from structuregs.geometry import SE3, Box
 from structuregs.joints import articulate
 from structuregs.model import ArticulatedObject, PosedParts, Splats
-from structuregs.raster import painted, painted_share, render
+from structuregs.raster import coverage_of, painted, render
 from structuregs.synthetic import RenderOptions, make_capture, make_object
 
 
@@ -76,12 +76,12 @@ def test_an_older_doubt_is_kept(capture: Capture):
     assert joint.review == "Older."
 
 
-def test_painted_shares_add_up_to_the_picture_s_coverage(capture: Capture):
+def test_what_some_splats_cover_and_what_the_others_do_adds_up_to_the_picture_s_coverage(capture: Capture):
     splats = hidden_ball(out=0.7).parts.at_state(1)
     camera = capture.train[0][0].camera
     some = torch.arange(len(splats)) % 3 == 0
-    total = painted_share(splats, some, camera) + painted_share(splats, ~some, camera)
-    assert total == pytest.approx(float(render(splats, camera).alpha.mean()), abs=1e-5)
+    total = coverage_of(splats, some, camera) + coverage_of(splats, ~some, camera)
+    torch.testing.assert_close(total, render(splats, camera).alpha, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -94,7 +94,7 @@ def test_what_each_splat_paints_is_what_it_takes_part_in(capture: Capture, backe
     each = painted(splats, camera)
     assert not each.requires_grad
     for some in (torch.arange(len(splats)) % 3 == 0, torch.arange(len(splats)) > len(splats) - 200):
-        assert float(each[some].sum()) == pytest.approx(painted_share(splats, some, camera), abs=2e-5)
+        assert float(each[some].sum()) == pytest.approx(float(coverage_of(splats, some, camera).mean()), abs=2e-5)
 
 
 def test_what_no_photo_shows_is_told_from_what_some_do(capture: Capture):

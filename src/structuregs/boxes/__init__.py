@@ -1,5 +1,6 @@
 """Clouds to boxes matched across states, with hypotheses for their motions."""
 
+from .alike import Face, Overlap, Shown
 from .config import SearchConfig
 from .cue import Cluster, CueConfig, StateLook, box_around, clusters
 from .fill import in_moving_box, seeded, strewn
@@ -10,9 +11,12 @@ from .survey import StartConfig, boxes_at_rest, boxes_of_parts, find_parts, look
 __all__ = [
     "Cluster",
     "CueConfig",
+    "Face",
     "MovingPart",
+    "Overlap",
     "PartSearch",
     "SearchConfig",
+    "Shown",
     "StartConfig",
     "StateLook",
     "box_around",

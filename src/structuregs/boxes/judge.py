@@ -13,7 +13,7 @@ from torch import Tensor
 from ..geometry import SE3, Box, Screw, screw_at
 from ..joints import kind_of
 from ..model import SH_C0, Splats
-from ..raster import Render, image_loss, painted_share, render
+from ..raster import Render, coverage_of, image_loss, render
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
@@ -73,7 +73,7 @@ class Scene:
         """Mean share of the judging photos that the part paints where it is."""
         both = Splats.concatenate([self.rest, part])
         chosen = torch.arange(len(both)) >= len(self.rest)
-        return float(np.mean([painted_share(both, chosen, self.look.stack.cameras[v]) for v in self.views]))
+        return float(np.mean([float(coverage_of(both, chosen, self.look.stack.cameras[v]).mean()) for v in self.views]))
 
     @property
     def pixels(self) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..geometry import SE3, screw_at
 from ..joints import kind_of
+from .alike import Face, Overlap, Shown
 from .cue import linked
 from .divide import AROUND, moving_along
 from .hypotheses import displacements, distinct, flips, stack_motions
@@ -28,7 +29,7 @@ class PartReview:
         """The parts as all of them together say."""
         parts = self.exchanged(self.without_doubles(found))
         parts = self._reconsider([self._at_its_clearest(part) for part in parts])
-        return self._settled(self._without_pieces(parts))
+        return [self._laid_alike(part) for part in self._settled(self._without_pieces(parts))]
 
     def without_doubles(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those that lie where others do and beside them explain nothing: found wrong before."""
@@ -179,6 +180,14 @@ class PartReview:
             again = [self.pieces.pulled(h, trial, 2 * self.config.steps) for h in hopeful]
             parts[index] = replace(part, hypothesis=measured(min(again, key=trial.cost), trial))
         return parts
+
+    def _laid_alike(self, part: MovingPart) -> MovingPart:
+        """The part, laid in the plane of its face where photos of both states are alike."""
+        pieces, here, there = self.pieces, self.pieces.looks[part.state], self.pieces.looks[1 - part.state]
+        own, other = Shown(here.stack, here.splats, pieces.held_by_part(part)), Shown(there.stack, there.splats, None)
+        overlap = Overlap.between(own, other, part.hypothesis.motion, pieces.box(part.points), pieces.voxel)
+        motion = Face.most_shown(overlap).laid_alike()
+        return part if motion is None else replace(part, hypothesis=replace(part.hypothesis, motion=motion))
 
     def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
         """The parts with two of them made one, which moves as the leader does."""

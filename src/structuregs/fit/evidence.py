@@ -1,4 +1,4 @@
-"""What shows in the photos: splats that none shows are nothing, and a motion between two places wants its part seen in both."""
+"""What shows in the photos: splats that none shows are nothing; a motion wants its part seen, and alike, in both states."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,10 +7,13 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from ..boxes import Overlap, Shown
 from ..capture import Capture, ImageStack, spread_cameras, stack_views
+from ..geometry import SE3, Box
 from ..joints import REVIEW_BELOW
 from ..model import ArticulatedObject, Joint, PosedParts
 from ..raster import painted
+from .boxes import object_size
 
 _SIZE = 128  # side of a square with as many pixels as the photos that are asked
 _PHOTOS = 16  # of either state
@@ -18,6 +21,11 @@ _ENOUGH = 0.2  # of what a part shows in one state: as much in the other leaves 
 _TRACE = 2e-6  # of a photo: a splat that paints less in all of them is not missed
 _LOOK = 400  # side of a square with as many pixels as the pictures that tell
 _LOOKS = 48  # of either state
+_CLOSER = 200  # side of a square with as many pixels as the photos that are laid upon each other
+_LAID = 24  # of either state
+_FEWEST = 50  # pixels that say something
+_EXACT = 1 / 64  # of the object's size: how exactly surfaces are known
+_NOTHING = 0.4  # photos that leave so much more unexplained of each other than nothing would say that a part is elsewhere
 
 
 @torch.no_grad()
@@ -67,6 +75,45 @@ def _weighed(joint: Joint, shares: list[float]) -> Joint:
     """The joint after a look at the share of either state's photos that its part paints."""
     score = min(min(shares) / max(*shares, 1e-12) / _ENOUGH, 1.0)
     hidden = shares.index(min(shares))
+    return _lowered(joint, score, f"Hardly a photo of state {hidden} shows the part: where it is there is a guess.")
+
+
+@torch.no_grad()
+def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject:
+    """The object with the confidence of its joints lowered where a part's photos of the two states are not alike.
+
+    Photos of one state are laid upon those of the other, as the model says where each pixel went.  They leave at most as much
+    of what varies unexplained as if nothing were laid there; where they leave more than that, what one state shows is not
+    where the other has it.  The factor is 1 up to there, 0 from 1.4 times that on, of the worse of both directions; where
+    that makes a joint doubtful, a sentence asks for a look.  Parts that no photos of both states show say nothing.
+
+    Args:
+        obj: as fitted.
+        capture: what it was fitted to.
+    """
+    parts = obj.parts.to(torch.device("cpu"))
+    unit = _EXACT * object_size(parts.boxes)
+    stacks = [
+        stack_views([views[v] for v in spread_cameras([view.camera for view in views], _LAID)], _CLOSER)
+        for views in capture.train
+    ]
+    boxes = Box(SE3(parts.boxes.T_world_box.wxyz_xyz.double()), parts.boxes.half_extents.double())
+    joints = []
+    for k, joint in enumerate(obj.joints, start=1):
+        first, second = (Shown(stack, parts.at_state(state), parts.part == k) for state, stack in enumerate(stacks))
+        motion = SE3(parts.motions.wxyz_xyz[k].double())
+        laid = (
+            Overlap.between(first, second, motion, boxes[k], unit),
+            Overlap.between(second, first, motion.inverse(), boxes[k].moved(motion), unit),
+        )
+        left = [overlap.unlike() for overlap in laid if len(overlap) > _FEWEST]
+        score = 1 - (max(left, default=0.0) - 1) / _NOTHING
+        sentence = "Where the part lies in either state, photos of the two do not look alike."
+        joints.append(_lowered(joint, min(max(score, 0.0), 1.0), sentence))
+    return replace(obj, joints=tuple(joints))
+
+
+def _lowered(joint: Joint, score: float, sentence: str) -> Joint:
+    """The joint with its confidence times the score; the sentence asks for a look where that makes it doubtful."""
     confidence = joint.confidence * score
-    sentence = f"Hardly a photo of state {hidden} shows the part: where it is there is a guess."
     return replace(joint, confidence=confidence, review=joint.review or (sentence if confidence < REVIEW_BELOW else ""))

@@ -3,7 +3,7 @@
 from .image_loss import image_loss
 from .planes import PlaneImage, render_planes
 from .records import Projection, Render
-from .render import blend, painted, painted_share, project, render
+from .render import blend, coverage_of, painted, project, render
 from .surface import Surface, render_surface
 
 __all__ = [
@@ -12,9 +12,9 @@ __all__ = [
     "Render",
     "Surface",
     "blend",
+    "coverage_of",
     "image_loss",
     "painted",
-    "painted_share",
     "project",
     "render",
     "render_planes",

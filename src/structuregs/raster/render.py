@@ -42,12 +42,12 @@ def render(
 
 
 @torch.no_grad()
-def painted_share(splats: Splats, chosen: Bool[Tensor, " N"], camera: Camera) -> float:
-    """The share of the image that some of the splats paint, where the others may stand before them."""
+def coverage_of(splats: Splats, chosen: Bool[Tensor, " N"], camera: Camera) -> Float[Tensor, "H W"]:
+    """The share of each pixel that some of the splats paint, where the others may stand before them."""
     sh = torch.zeros(len(splats), 1, 3, device=splats.means.device)
     sh[:, 0] = torch.where(chosen, 0.5, -0.5)[:, None] / SH_C0
     black = splats.means.new_zeros(3)
-    return float(render(replace(splats, sh=sh), camera, background=black).rgb.mean())
+    return render(replace(splats, sh=sh), camera, background=black).rgb[..., 0]
 
 
 def painted(splats: Splats, camera: Camera) -> Float[Tensor, " N"]:

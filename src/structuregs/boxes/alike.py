@@ -1,0 +1,281 @@
+"""What the photos of both states show of a part, laid upon each other: whether it is alike, and where in its plane it would be.
+
+Photos and masks judge a motion by all that is drawn.  A door that is shut, plain, and of its cupboard's colour is then held by
+little but its outline, which quick looks draw too wide.  What a face shows within its outline, such as a handle, panels or
+grain, says better how it lies in its plane; how far before that plane, and how it leans, it does not say.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64
+from scipy import ndimage
+from scipy.optimize import minimize
+from torch import Tensor
+
+from ..capture import ImageStack, spread_cameras
+from ..geometry import SE3, Box
+from ..model import Splats
+from ..raster import coverage_of, render_surface
+
+_VIEWS = 48  # photos of the one state, each laid upon...
+_NEIGHBOURS = 4  # ...so many of the other's: those that see the part most nearly alike,...
+_ASKEW = 0.5  # ...from directions whose cosine is at least this
+_OBLIQUE = 0.2  # the cosine to a face's normal below which a camera does not see it
+_FLAT = 0.85  # the cosine to a face's normal from which a pixel's surface is its
+_CLEAR = 0.8  # of a pixel's light has to be the part's
+_BEFORE, _UNDER = 2.5, 1.5  # units: what lies farther from the other state's surface is hidden there, or under the face
+_BLURS = (1.6, 0.8)  # pixels
+_CUT_OFF = 0.15  # differences of brightness count as at most this
+_PLAIN = 0.002  # what varies by less than half a grey level says nothing
+_REACH = 3  # units to either side in which a face is looked for,...
+_FINER = 2  # ...and so many about what was found in each finer look
+_FEWEST = 100  # pixels of each half of the photos that say something
+_TELLING = 0.75  # units: both halves of the photos have to find the same place, within reach,...
+_ALIKE = 0.6  # ...no more than this share of what varies may then be left unexplained,...
+_BETTER = 0.85  # ...and less than this share of what was
+
+
+class Shown:
+    """One state's photos, and the splats of a part among all that they show.
+
+    Args:
+        stack: the photos.
+        splats: all splats, in the world.
+        part: which of them are the part's; None where that is not known.
+    """
+
+    def __init__(self, stack: ImageStack, splats: Splats, part: Bool[Tensor, " N"] | None):
+        self.stack = stack
+        self.splats = splats
+        self.part = part
+        poses = [camera.T_world_camera.inverse().to(dtype=torch.float64) for camera in stack.cameras]
+        self._rotations = np.stack([pose.rotation.numpy() for pose in poses])
+        self._offsets = np.stack([pose.xyz.numpy() for pose in poses])
+        self._lenses = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in stack.cameras])
+        self._depths: dict[int, Float32[np.ndarray, "H W"]] = {}
+        self._clear: dict[int, Bool[np.ndarray, "H W"]] = {}
+
+    @cached_property
+    def centres(self) -> Float64[Tensor, "V 3"]:
+        """Of the cameras, in the world."""
+        return torch.stack([camera.centre.double() for camera in self.stack.cameras])
+
+    @cached_property
+    def blurred(self) -> dict[float, Float32[np.ndarray, "V H W"]]:
+        """Brightness of what is not background, by how many pixels it is blurred."""
+        return {by: np.stack([self._blurred(v, by) for v in range(len(self.stack))]) for by in _BLURS}
+
+    def _blurred(self, v: int, by: float) -> Float32[np.ndarray, "H W"]:
+        rgb, alpha = (image.numpy() for image in self.stack.target(v))
+        covered = ndimage.gaussian_filter(alpha, by)
+        return ndimage.gaussian_filter(rgb.mean(-1) * alpha, by) / np.maximum(covered, 1e-3)
+
+    def depth(self, v: int) -> Float32[np.ndarray, "H W"]:
+        """Of the surface in a photo; 0 where there is none."""
+        if v not in self._depths:
+            self._depths[v] = render_surface(self.splats, self.stack.cameras[v]).depth
+        return self._depths[v]
+
+    def clear(self, v: int) -> Bool[np.ndarray, "H W"]:
+        """Which pixels of a photo show the part, or any surface where the part is not known, and so do those beside them."""
+        if v not in self._clear:
+            solid = self.depth(v) > 0
+            if self.part is not None:
+                with torch.no_grad():
+                    solid &= coverage_of(self.splats, self.part, self.stack.cameras[v]).numpy() > _CLEAR
+                solid = ndimage.binary_erosion(solid)
+            self._clear[v] = solid
+        return self._clear[v]
+
+    def surface(self, v: int) -> tuple[Float64[np.ndarray, "H W 3"], Float64[np.ndarray, "H W 3"]]:
+        """What each pixel of a photo shows, and its normal toward the camera, in the world."""
+        origin, rays = (t.double().numpy() for t in self.stack.cameras[v].rays())
+        points = origin + rays * self.depth(v)[..., None]
+        normals = ndimage.uniform_filter(np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0)), 3, axes=(0, 1))
+        normals *= -np.sign((normals * rays).sum(-1, keepdims=True))
+        return points, normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+
+    def project(
+        self, points: Float64[np.ndarray, "P 3"], photos: Int64[np.ndarray, " P"]
+    ) -> tuple[Float64[np.ndarray, "P 2"], Float64[np.ndarray, " P"]]:
+        """Row and column (pixel centres are whole numbers), and depth along z, of each point in a photo of its own."""
+        there = np.einsum("pij,pj->pi", self._rotations[photos], points) + self._offsets[photos]
+        depth = np.maximum(there[:, 2], 1e-9)
+        fx, fy, cx, cy = self._lenses[photos].T
+        return np.stack([fy * there[:, 1] / depth + cy, fx * there[:, 0] / depth + cx], 1) - 0.5, there[:, 2]
+
+    def sees(self, points: Float64[np.ndarray, "P 3"], v: int, within: float) -> Bool[np.ndarray, " P"]:
+        """Which points lie on the surface that a photo shows of the part, as far as `within` before or behind it."""
+        surface, clear = self.depth(v), self.clear(v)
+        at, depth = self.project(points, np.full(len(points), v))
+        row, column = np.rint(at).astype(int).T
+        inside = (row >= 0) & (row < surface.shape[0]) & (column >= 0) & (column < surface.shape[1])
+        row, column = row * inside, column * inside
+        return inside & clear[row, column] & (np.abs(surface[row, column] - depth) < within)
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Pixels of photos of one state that show a part, each with a photo of the other state that shows the same place of it.
+
+    Attributes:
+        here, there: the one state and the other.
+        motion: of the part, from the one to the other, as it was found.
+        box: of the part, in the one state.
+        unit: how exactly surfaces are known, world units.
+        pixels: number of the photo, row, and column.
+        points: what they show, moved to the other state, in the world.
+        local: the same from the centre of the box, in its axes.
+        normals: of the surface, in these axes.
+        photos: of the other state; pixels of the same two photos lie together.
+    """
+
+    here: Shown
+    there: Shown
+    motion: SE3
+    box: Box
+    unit: float
+    pixels: Int64[np.ndarray, "P 3"]
+    points: Float64[np.ndarray, "P 3"]
+    local: Float64[np.ndarray, "P 3"]
+    normals: Float64[np.ndarray, "P 3"]
+    photos: Int64[np.ndarray, " P"]
+
+    @staticmethod
+    def between(here: Shown, there: Shown, motion: SE3, box: Box, unit: float) -> "Overlap":
+        """What photos of both states show together; the arguments are the attributes of the same names."""
+        centre, axes = box.T_world_box.xyz.numpy(), box.T_world_box.rotation.numpy()
+        to_here, to_there = _directions(here, there, motion, box)
+        rows = [[np.zeros((0, 3), int), *np.zeros((3, 0, 3)), np.zeros(0, int)]]
+        for v in spread_cameras(here.stack.cameras, _VIEWS):
+            pixels = np.argwhere(here.clear(v))
+            alike = to_there @ to_here[v]
+            if not len(pixels) or alike.max() < _ASKEW:
+                continue
+            points, normals = (image[tuple(pixels.T)] for image in here.surface(v))
+            moved = motion.apply(torch.from_numpy(points)).numpy()
+            numbered = np.insert(pixels, 0, v, axis=1)
+            for u in np.argsort(-alike)[:_NEIGHBOURS]:
+                if alike[u] >= _ASKEW:
+                    seen = there.sees(moved, int(u), _BEFORE * unit)
+                    row = (numbered, moved, (points - centre) @ axes, normals @ axes, np.full(len(points), u))
+                    rows.append([column[seen] for column in row])
+        return Overlap(here, there, motion, box, unit, *map(np.concatenate, zip(*rows, strict=True)))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def of(self, chosen: Bool[np.ndarray, " P"]) -> "Overlap":
+        """As some of the pixels show it."""
+        names = ("pixels", "points", "local", "normals", "photos")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+
+    def unlike(self, further: SE3 | None = None, blur: float = _BLURS[-1]) -> float:
+        """What photos of the other state leave unexplained of those of the one, as a share of how much these vary.
+
+        Each pair of photos has a brightness and a contrast of its own.  Photos that have nothing in common leave a little more
+        than 1; 1 is also what is plain, or not seen at all.
+
+        Args:
+            further: a motion of the world in the other state, after the one that was found.
+            blur: of the photos, pixels.
+        """
+        if not len(self):
+            return 1.0
+        moved = self.points if further is None else further.apply(torch.from_numpy(self.points)).numpy()
+        at = np.concatenate([self.photos[:, None], self.there.project(moved, self.photos)[0]], 1)
+        seen = ndimage.map_coordinates(self.there.blurred[blur], at.T, order=1, mode="nearest").astype(np.float64)
+        asked = self.here.blurred[blur][tuple(self.pixels.T)].astype(np.float64)
+        changes = (np.diff(self.pixels[:, 0]) != 0) | (np.diff(self.photos) != 0)
+        starts = np.concatenate([[0], np.flatnonzero(changes) + 1])
+        count = np.diff(np.append(starts, len(at)))
+
+        def total(values: Float64[np.ndarray, " P"]) -> Float64[np.ndarray, " P"]:
+            return np.repeat(np.add.reduceat(values, starts), count)
+
+        sizes = np.repeat(count, count)
+        seen, asked = seen - total(seen) / sizes, asked - total(asked) / sizes
+        contrast = np.clip(total(seen * asked) / np.maximum(total(seen * seen), 1e-9), 0.5, 2.0)
+        left = (asked - contrast * seen) / np.maximum(contrast, 1.0)
+        unexplained, varied = (np.minimum(np.abs(values), _CUT_OFF).mean() for values in (left, asked))
+        return float(unexplained / varied) if varied > _PLAIN else 1.0
+
+
+@dataclass(frozen=True)
+class Face:
+    """A face of a part that photos of both states show.
+
+    How it goes in its plane is told in units: along both its axes, and at its rim when it turns.
+
+    Attributes:
+        overlap: the pixels that show it.
+        pose: of the face where it was found in the other state, z along its normal.
+    """
+
+    overlap: Overlap
+    pose: SE3
+
+    @staticmethod
+    def most_shown(overlap: Overlap) -> "Face":
+        """The face of which there are most pixels, with what stands out from it."""
+        to_here, to_there = _directions(overlap.here, overlap.there, overlap.motion, overlap.box)
+        most, best, chosen = 0, 0, np.zeros(len(overlap), bool)
+        for axis, sign in itertools.product(range(3), (1, -1)):
+            both = sign * np.stack([to_here[overlap.pixels[:, 0], axis], to_there[overlap.photos, axis]])
+            faced, height = (both > _OBLIQUE).all(0), sign * overlap.local[:, axis]
+            on = faced & (sign * overlap.normals[:, axis] > _FLAT)
+            if on.sum() > most:
+                most, best, chosen = on.sum(), axis, faced & (height > np.median(height[on]) - _UNDER * overlap.unit)
+        pose = overlap.motion @ overlap.box.T_world_box
+        turned = pose.rotation[:, [(best + 1) % 3, (best + 2) % 3, best]]
+        return Face(overlap.of(chosen), SE3.from_rotation(turned, pose.xyz))
+
+    def moved(self, place: Float64[np.ndarray, " 3"]) -> SE3:
+        """The motion of the world that brings the face from where it was found to a place."""
+        x, y, turn = (place * self.overlap.unit).tolist()
+        tangent = torch.tensor([x, y, 0, 0, 0, turn / float(self.overlap.box.half_extents.norm())], dtype=torch.float64)
+        return self.pose @ SE3.exp(tangent) @ self.pose.inverse()
+
+    def unlike(self, place: Float64[np.ndarray, " 3"], blur: float = _BLURS[-1]) -> float:
+        """What photos leave unexplained of each other with the face at a place (see `Overlap.unlike`)."""
+        return self.overlap.unlike(self.moved(place), blur)
+
+    def place(self) -> Float64[np.ndarray, " 3"]:
+        """Where the photos are most alike."""
+        steps = np.arange(-_REACH, _REACH + 1.0)
+        tried = [np.array([x, y, 0.0]) for x in steps for y in steps]
+        place = min(tried, key=lambda at: self.unlike(at, _BLURS[0]))
+        for blur in _BLURS:
+            bounds = [(at - _FINER, at + _FINER) for at in place]
+            options = {"maxfev": 200, "xtol": 3e-3, "ftol": 1e-4}
+            place = minimize(self.unlike, place, args=(blur,), method="Powell", bounds=bounds, options=options).x
+        return place
+
+    def laid_alike(self) -> SE3 | None:
+        """The motion of the part with the face where its photos are alike.
+
+        None where it says no better: a face may tell nothing, or light make it look another way.
+        """
+        halves = [Face(self.overlap.of(self.overlap.pixels[:, 0] % 2 == odd), self.pose) for odd in (0, 1)]
+        if min(len(half.overlap) for half in halves) < _FEWEST:
+            return None
+        one, other = (half.place() for half in halves)
+        if np.abs(one - other).max() > _TELLING:
+            return None
+        place = self.place()
+        if np.abs(place).max() > _REACH or self.unlike(place) > min(_ALIKE, _BETTER * self.unlike(np.zeros(3))):
+            return None
+        return self.moved(place) @ self.overlap.motion
+
+
+def _directions(here: Shown, there: Shown, motion: SE3, box: Box) -> tuple[np.ndarray, np.ndarray]:
+    """From the part to the cameras of either state (V 3), in the axes of its box."""
+    one, other = (
+        torch.nn.functional.normalize(centres - box.T_world_box.xyz, dim=-1) @ box.T_world_box.rotation
+        for centres in (here.centres, motion.inverse().apply(there.centres))
+    )
+    return one.numpy(), other.numpy()
