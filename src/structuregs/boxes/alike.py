@@ -192,14 +192,8 @@ class Overlap:
         asked = self.here.blurred[blur][tuple(self.pixels.T)].astype(np.float64)
         changes = (np.diff(self.pixels[:, 0]) != 0) | (np.diff(self.photos) != 0)
         starts = np.concatenate([[0], np.flatnonzero(changes) + 1])
-        count = np.diff(np.append(starts, len(at)))
-
-        def total(values: Float64[np.ndarray, " P"]) -> Float64[np.ndarray, " P"]:
-            return np.repeat(np.add.reduceat(values, starts), count)
-
-        sizes = np.repeat(count, count)
-        seen, asked = seen - total(seen) / sizes, asked - total(asked) / sizes
-        contrast = np.clip(total(seen * asked) / np.maximum(total(seen * seen), 1e-9), 0.5, 2.0)
+        seen, asked = seen - _means(seen, starts), asked - _means(asked, starts)
+        contrast = np.clip(_means(seen * asked, starts) / np.maximum(_means(seen * seen, starts), 1e-12), 0.5, 2.0)
         left = (asked - contrast * seen) / np.maximum(contrast, 1.0)
         unexplained, varied = (np.minimum(np.abs(values), _CUT_OFF).mean() for values in (left, asked))
         return float(unexplained / varied) if varied > _PLAIN else 1.0
@@ -279,3 +273,9 @@ def _directions(here: Shown, there: Shown, motion: SE3, box: Box) -> tuple[np.nd
         for centres in (here.centres, motion.inverse().apply(there.centres))
     )
     return one.numpy(), other.numpy()
+
+
+def _means(values: Float64[np.ndarray, " P"], starts: Int64[np.ndarray, " G"]) -> Float64[np.ndarray, " P"]:
+    """The mean of the group that each value is of; groups lie together, each from its start on."""
+    count = np.diff(np.append(starts, len(values)))
+    return np.repeat(np.add.reduceat(values, starts) / count, count)
