@@ -33,10 +33,11 @@ _CUT_OFF = 0.15  # differences of brightness count as at most this
 _PLAIN = 0.002  # what varies by less than half a grey level says nothing
 _REACH = 3  # units to either side in which a face is looked for,...
 _FINER = 2  # ...and so many about what was found in each finer look
+_TURNED = 0.95  # a face turns in its plane where that leaves less than this share of what is left without
 _FEWEST = 100  # pixels of each half of the photos that say something
-_TELLING = 0.75  # units: both halves of the photos have to find the same place, within reach,...
-_ALIKE = 0.6  # ...no more than this share of what varies may then be left unexplained,...
-_BETTER = 0.85  # ...and less than this share of what was
+_TELLING = 0.5  # of the way to it: both halves of the photos have to find the same place, within reach,...
+_ALIKE = 0.8  # ...no more than this share of what varies may then be left unexplained,...
+_BETTER = 0.95  # ...and less than this share of what was
 
 
 class Shown:
@@ -239,15 +240,22 @@ class Face:
         return self.overlap.unlike(self.moved(place), blur)
 
     def place(self) -> Float64[np.ndarray, " 3"]:
-        """Where the photos are most alike."""
+        """Where the photos are most alike; turned only where that makes them clearly more so."""
         steps = np.arange(-_REACH, _REACH + 1.0)
         tried = [np.array([x, y, 0.0]) for x in steps for y in steps]
         place = min(tried, key=lambda at: self.unlike(at, _BLURS[0]))
         for blur in _BLURS:
-            bounds = [(at - _FINER, at + _FINER) for at in place]
-            options = {"maxfev": 200, "xtol": 3e-3, "ftol": 1e-4}
-            place = minimize(self.unlike, place, args=(blur,), method="Powell", bounds=bounds, options=options).x
-        return place
+            place = self._nearby(place, blur, np.array([_FINER, _FINER, 0.0]))
+        turned = self._nearby(place, _BLURS[-1], np.full(3, float(_FINER)))
+        return turned if self.unlike(turned) < _TURNED * self.unlike(place) else place
+
+    def _nearby(
+        self, place: Float64[np.ndarray, " 3"], blur: float, reach: Float64[np.ndarray, " 3"]
+    ) -> Float64[np.ndarray, " 3"]:
+        """Where the photos are most alike near a place."""
+        bounds = list(zip(place - reach, place + reach, strict=True))
+        options = {"maxfev": 200, "xtol": 3e-3, "ftol": 1e-4}
+        return minimize(self.unlike, place, args=(blur,), method="Powell", bounds=bounds, options=options).x
 
     def laid_alike(self) -> SE3 | None:
         """The motion of the part with the face where its photos are alike.
@@ -258,10 +266,9 @@ class Face:
         if min(len(half.overlap) for half in halves) < _FEWEST:
             return None
         one, other = (half.place() for half in halves)
-        if np.abs(one - other).max() > _TELLING:
-            return None
         place = self.place()
-        if np.abs(place).max() > _REACH or self.unlike(place) > min(_ALIKE, _BETTER * self.unlike(np.zeros(3))):
+        away = np.abs(place).max() > _REACH or np.linalg.norm(one - other) > _TELLING * np.linalg.norm(place)
+        if away or self.unlike(place) > min(_ALIKE, _BETTER * self.unlike(np.zeros(3))):
             return None
         return self.moved(place) @ self.overlap.motion
 
