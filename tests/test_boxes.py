@@ -37,13 +37,14 @@ from structuregs.boxes.hypotheses import (
     stack_motions,
     turn_about,
 )
-from structuregs.boxes.judge import Scene, Trial, refine, simplest
+from structuregs.boxes.judge import Scene, Trial, refine, shortest, simplest
 from structuregs.boxes.partition import Division, Found, undivided
 from structuregs.boxes.pieces import Pieces
 from structuregs.boxes.review import PartReview
-from structuregs.capture import Capture, TrueJoint
-from structuregs.geometry import SE3, Box, Screw
+from structuregs.capture import Capture, ImageStack, TrueJoint
+from structuregs.geometry import SE3, Box, Camera, Screw
 from structuregs.joints import kind_of
+from structuregs.model import SH_C0, Splats
 from structuregs.points import points_from
 from structuregs.raster import render
 from structuregs.synthetic import KnownObject, Lighting, RenderOptions, make_capture, make_object
@@ -293,6 +294,35 @@ def trial_of_screen() -> Trial:
     return Trial(there, here, looks[1].splats, looks[0].splats[inside[0]], screen, weight=0.1, most=0.1, near=0.0, least=0.01)
 
 
+def cupboard_and_tray(pushed: float) -> Trial:
+    """A tray before the front of a shut cupboard, .8 wide; photos of the other state see it pushed in so far, or, at 0, not."""
+
+    def panels(box: Box, grey: float) -> Splats:
+        means = torch.from_numpy(points_of(box, 12000)).float()
+        sh = torch.full((len(means), 1, 3), (grey - 0.5) / SH_C0)
+        upright = torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
+        return Splats(means, upright, torch.full((len(means), 3), math.log(0.015)), torch.full((len(means),), 4.0), sh)
+
+    cupboard = panels(Box(NO_MOTION, torch.tensor([0.4, 0.4, 0.4], dtype=F64)), 0.7)
+    box = Box(SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0.75, 0, 0], dtype=F64)), torch.tensor([0.15, 0.2, 0.1], dtype=F64))
+    tray = panels(box, 0.2)
+    stacks = []
+    for moved in (-pushed if pushed else None, 0.0):
+        there = [] if moved is None else [tray.moved(SE3.from_quat(NO_MOTION.wxyz, torch.tensor([moved, 0, 0], dtype=F64)))]
+        rgb, alpha, cameras = [], [], []
+        for k in range(8):
+            turn = SE3.exp(torch.tensor([0, 0, 0, 0, -math.pi * (k + 0.5) / 8, 0]))  # from z = -4 by x = 4 to z = 4
+            cameras.append(Camera(turn @ SE3.exp(torch.tensor([0, 0, -4.0, 0, 0, 0])), 100.0, 100.0, 32.0, 32.0, 64, 64))
+            picture = render(Splats.concatenate([cupboard, *there]), cameras[-1])
+            rgb.append((picture.rgb.clamp(0, 1) * 255).round().byte().numpy())
+            alpha.append((picture.alpha * 255).round().byte().numpy())
+        stacks.append(ImageStack(tuple(cameras), np.stack(rgb), np.stack(alpha)))
+    look = looks_of("laptop")[1][0]
+    still = KDTree(cupboard.means.numpy())
+    there, here = (Scene(replace(look, stack=stack), cupboard, np.arange(8), still) for stack in stacks)
+    return Trial(there, here, cupboard, tray, box, weight=0.04, most=0.04, near=0.0, least=0.002)
+
+
 @dataclass(frozen=True)
 class Loose(Trial):
     """A part that the photos lose little by wherever it goes: `aside` for a unit that it comes to lie aside of `at`."""
@@ -484,6 +514,20 @@ class TestParts:
             assert float(found.angle) == 0
             x, y, z = found.xyz.tolist()
             assert (x, y, z) == pytest.approx(slide.xyz.tolist() if told else (0.3 * np.cos(angle), 0, 0), abs=1e-9)
+
+    @pytest.mark.parametrize(
+        ("pushed", "told"), [pytest.param(0.0, 0.62, id="hidden"), pytest.param(0.4, 0.4, id="seen to stop half way")]
+    )
+    def test_a_slide_out_of_sight_goes_no_farther_than_it_has_to(self, pushed: float, told: float):
+        trial = cupboard_and_tray(pushed)
+        slide = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([-told, 0, 0], dtype=F64))
+        start = trial.judge(Hypothesis(slide, 0.0, 0.0, 0.0))
+        found = shortest(start, trial)
+        if pushed:
+            assert found is start
+        else:  # the tray's front is .5 before the front of the cupboard
+            assert 0.5 <= -float(found.motion.xyz[0]) < 0.56
+            assert found.motion.xyz[1:].abs().max() < 1e-9
 
     def test_the_photos_of_both_states_speak_for_the_true_motion(self):
         (true,) = looks_of("laptop")[0].joints

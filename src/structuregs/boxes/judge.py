@@ -21,6 +21,9 @@ _ALPHA_WEIGHT = 0.5  # of the mask's error beside the colour's
 _FEW = 4  # photos of either state that do for a quick look
 _HIDDEN = 0.3  # of a part's weight speaks against a turn that hides the part, ...
 _SEEN_SHUT = 0.2  # ...none against one after which so much is seen of it, against its own state; shut doors show more
+_GONE = 0.1  # a slide after which less than this share of a part is seen takes it out of sight, ...
+_PEEPS = 0.01  # ...if it costs and helps the other state's photos no more than this share of the part's weight
+_SLIDES = 32  # lengths that are tried
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
 
@@ -276,3 +279,25 @@ def measured(hypothesis: Hypothesis, trial: Trial) -> Hypothesis:
     )
     q = float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
     return min(hypothesis, trial.judge(replace(hypothesis, motion=screw.motion(q))), key=lambda h: h.error)
+
+
+def shortest(hypothesis: Hypothesis, trial: Trial) -> Hypothesis:
+    """The hypothesis; a slide that takes the part out of sight goes no farther than it has to.
+
+    A tray that was pushed in behind a door could be anywhere there, for all that photos say.  Cupboards are built so that what
+    slides in ends just behind what hides it.
+
+    Args:
+        hypothesis: a judged motion.
+        trial: the part between the photos.
+    """
+    there, margin = trial.there, _PEEPS * trial.weight
+    if kind_of(hypothesis.motion) != "prismatic" or hypothesis.image_error < there.absent - margin:
+        return hypothesis
+    screw, q = screw_at(hypothesis.motion, "prismatic", trial.box.T_world_box.xyz)
+    for n in range(1, _SLIDES):
+        motion = screw.motion(q * n / _SLIDES)
+        hidden = there.error(trial.piece, motion) < there.absent + margin
+        if hidden and there.footprint(trial.piece.moved(motion)) < _GONE * trial.in_sight:
+            return trial.judge(trial.moved(hypothesis, motion))
+    return hypothesis

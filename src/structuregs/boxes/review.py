@@ -14,7 +14,7 @@ from .alike import Face, Overlap, Shown
 from .cue import linked
 from .divide import AROUND, moving_along
 from .hypotheses import displacements, distinct, flips, stack_motions
-from .judge import Trial, measured
+from .judge import Trial, measured, shortest
 from .pieces import MovingPart, Pieces
 
 
@@ -178,7 +178,7 @@ class PartReview:
             judged = [trial.judge(h) for h in ways]
             hopeful = [h for h in judged if trial.cost(h) < trial.cost(judged[0]) + self.config.hopeless * part.weight]
             again = [self.pieces.pulled(h, trial, 2 * self.config.steps) for h in hopeful]
-            parts[index] = replace(part, hypothesis=measured(min(again, key=trial.cost), trial))
+            parts[index] = replace(part, hypothesis=shortest(measured(min(again, key=trial.cost), trial), trial))
         return parts
 
     def _laid_alike(self, part: MovingPart) -> MovingPart:
