@@ -443,6 +443,19 @@ class TestParts:
             assert gap < 0.08
         assert parts[0].weight >= parts[1].weight
 
+    def test_photos_pull_what_moves_little_home_from_rest(self):
+        obj, looks = looks_of("switch")
+        (true,) = obj.joints
+        search = PartSearch(looks, SMALL.search, seed=0)
+        pieces, (cluster, *_) = search.pieces, search.pieces.clusters
+        alone = pieces.trial(cluster.state, cluster.points, pieces.splats_in({0}), pieces.weights[0], [])
+        found = search.from_rest(0, alone, set())
+        part = MovingPart(cluster.state, (cluster.points,), found, 0.0, alone.weight)
+        (_, left), (_, moved) = (errors(motion, part.points_in(0), true) for motion in (part.motion, NO_MOTION))
+        assert left < 0.4 * moved
+        assert found.outside < 0.2
+        assert alone.cost(found) < 0
+
     def test_points_that_no_photo_needs_are_no_part(self):
         looks = looks_of("laptop")[1]
         search = PartSearch(looks, SMALL.search, seed=0)

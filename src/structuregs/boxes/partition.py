@@ -197,14 +197,13 @@ class PartSearch:
         state, other = cluster.state, 1 - cluster.state
         hull, nothing = pieces.looks[other].hull, np.zeros((0, 3))
         open_ = [i for i in range(len(pieces)) if i not in done]
-        arrivals = [i for i in open_ if pieces.clusters[i].state == other]
+        arrivals = self._arrivals(index, done)
         siblings = [i for i in open_ if pieces.clusters[i].state == state and i != index and not self._known_apart(i, index)]
         wholes = self._unions(siblings, {index})
         motions = candidate_motions(wholes, pieces.base_box, list(itertools.product(wholes, self._unions(arrivals, set()))))
-        landing = np.concatenate([pieces.clusters[i].points for i in arrivals]) if arrivals else nothing
         rough = hull_scores(motions, pieces.sample(cluster.points, 40), hull, nothing, box)[0]
         motions = motions[np.flatnonzero(rough < rough.min() + 1.0)]
-        points, landing = pieces.sample(cluster.points, 300), pieces.sample(landing, 300)
+        points, landing = pieces.sample(cluster.points, 300), pieces.sample(self._landing(arrivals), 300)
         outside, unexplained = hull_scores(motions, points, hull, landing, box)
         travel = displacements(motions, SE3.identity(dtype=torch.float64), box)
         ranked = np.argsort(outside + unexplained + 0.05 * travel, kind="stable")
@@ -249,6 +248,8 @@ class PartSearch:
             trial = self._with(alone, index, group)
             pulled = pieces.pulled(trial.judge(start), trial, self.config.steps)
             refined.append((pulled, group, trial.cost(pulled)))
+        near = self.from_rest(index, alone, done)
+        refined.append((near, frozenset(), alone.cost(near)))
         refined.sort(key=lambda row: row[2])
         chosen = distinct(stack_motions([h.motion for h, _, _ in refined]), box, 0.1, len(refined))
         best, group, _ = refined[0]
@@ -258,6 +259,32 @@ class PartSearch:
         points = tuple(pieces.clusters[i].points for i in sorted(members))
         rivals = tuple(refined[c][0] for c in chosen[1:])
         return MovingPart(state, points, best, trial.gain(best), alone.weight, rivals), members, trial
+
+    def from_rest(self, index: int, alone: Trial, done: set[int]) -> Hypothesis:
+        """Where the photos pull a cluster that they find at rest: what moves little they bring home, wherever its hinge is.
+
+        Only then are the masks asked; of a part at rest they know nothing but that it has moved.
+
+        Args:
+            index: of the cluster.
+            alone: the cluster between the photos.
+            done: clusters that belong to a part.
+        """
+        pieces, rest = self.pieces, SE3.identity(dtype=torch.float64)
+        start = alone.judge(alone.moved(Hypothesis(rest, 0.0, 0.0, 0.0), rest))
+        pulled = pieces.pulled(start, alone, 2 * self.config.steps)
+        hull, landing = pieces.looks[1 - pieces.clusters[index].state].hull, self._landing(self._arrivals(index, done))
+        masks = hull_scores(stack_motions([pulled.motion]), pieces.clusters[index].points, hull, landing, alone.box)
+        return replace(pulled, outside=float(masks[0][0]), unexplained=float(masks[1][0]))
+
+    def _arrivals(self, index: int, done: set[int]) -> list[int]:
+        """The other state's clusters that a cluster may show as there."""
+        clusters = self.pieces.clusters
+        return [i for i in range(len(clusters)) if i not in done and clusters[i].state != clusters[index].state]
+
+    def _landing(self, arrivals: list[int]) -> Points:
+        """The points of such clusters."""
+        return np.concatenate([np.zeros((0, 3)), *(self.pieces.clusters[i].points for i in arrivals)])
 
     def _with(self, alone: Trial, index: int, group: frozenset[int]) -> Trial:
         """The trial of a cluster with what moves along."""

@@ -152,6 +152,20 @@ def _chest(rng: np.random.Generator) -> KnownObject:
     return KnownObject("chest", (KnownPart("base", tuple(base)), _opened("lid", cover, joint)))
 
 
+def _switch(rng: np.random.Generator) -> KnownObject:
+    """A rocker between two rails on a plate: it tips a little about its middle, and either end hides what the other shows."""
+    base = [
+        _board((-0.6, -0.05, -0.9), (0.6, 0.05, 0.9), _texture(rng, "noise")),
+        _board((-0.4, -0.1, -0.6), (-0.3, -0.05, 0.6), _texture(rng, "plain")),
+        _board((0.3, -0.1, -0.6), (0.4, -0.05, 0.6), _texture(rng, "plain")),
+        _board((-0.28, -0.14, -0.06), (0.28, -0.05, 0.06), _texture(rng, "plain")),
+    ]
+    rocker = _board((-0.28, -0.28, -0.5), (0.28, -0.16, 0.5), _texture(rng, "checker", 5.0))
+    tip = rng.uniform(7, 9)
+    joint = _hinge((1, 0, 0), (0, -0.16, 0), -tip, tip)
+    return KnownObject("switch", (KnownPart("base", tuple(base)), _opened("rocker", [rocker], joint)))
+
+
 def _static(rng: np.random.Generator) -> KnownObject:
     """A stool: nothing moves."""
     legs = _texture(rng, "wood")
@@ -173,6 +187,7 @@ OBJECTS: dict[str, Callable[[np.random.Generator], KnownObject]] = {
     "slider": _slider,
     "stapler": _stapler,
     "chest": _chest,
+    "switch": _switch,
     "fridge": _fridge,
     "door": _door,
     "drawer": _drawer,
