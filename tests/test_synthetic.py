@@ -57,7 +57,7 @@ def test_depth_lies_on_the_surface_of_the_box_that_is_seen(obj):
         for camera in orbit(obj, 2, SMALL, azimuth=4.0):
             picture = draw(boxes, camera, Lighting(), samples=1)
             points = surface_points(camera, picture.depth)
-            assert (picture.box >= 0).sum() > 300
+            assert (picture.box >= 0).sum() > 200
             np.testing.assert_array_equal(picture.box >= 0, picture.depth > 0)
             for b in np.unique(picture.box[picture.box >= 0]):
                 local = stacked[b].T_world_box.inverse().apply(points[torch.from_numpy(picture.box == b)])
@@ -161,7 +161,7 @@ def test_cameras_see_the_whole_object_in_both_states(obj):
     for view in (view for split in (capture.train, capture.test) for views in split for view in views):
         alpha = view.rgba[..., 3]
         assert not any(edge.any() for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
-        assert 0.05 < (alpha / 255).mean() < 0.7
+        assert 0.02 < (alpha / 255).mean() < 0.7
 
 
 @pytest.mark.parametrize("obj", ALL, ids=lambda obj: obj.name)

@@ -1,21 +1,18 @@
 """The known objects by name; the seed varies their sizes and textures.  Fronts face -y, z is up, about two units in size."""
 
-import colorsys
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import torch
 
 from ..capture import TrueJoint
-from ..geometry import SE3, Box
-from .objects import KnownObject, KnownPart, Texture, TexturedBox, TextureKind
+from .boards import Point, board, hinge, opened, texture, walls
+from .objects import KnownObject, KnownPart, Texture, TexturedBox
+from .things import THINGS
 
 _GAP = 0.012  # between a front and its neighbours
 _BOARD = 0.05  # thickness of boards
-_Point = tuple[float | int, float | int, float | int]
 
 
 @dataclass(frozen=True)
@@ -92,33 +89,33 @@ def _drawer(rng: np.random.Generator) -> KnownObject:
 def _laptop(rng: np.random.Generator) -> KnownObject:
     """A screen on a hinge behind the keys, open in both states."""
     w, d = rng.uniform(0.6, 0.7), rng.uniform(0.42, 0.5)
-    shell = _texture(rng, "noise")
+    shell = texture(rng, "noise")
     base = [
-        _board((-w, -d, 0), (w, d, 0.07), shell),
-        _board((-0.85 * w, -0.2 * d, 0.07), (0.85 * w, 0.8 * d, 0.085), _texture(rng, "checker", 9.0)),
-        _board((-0.25 * w, -0.85 * d, 0.07), (0.25 * w, -0.35 * d, 0.078), _texture(rng, "plain")),
+        board((-w, -d, 0), (w, d, 0.07), shell),
+        board((-0.85 * w, -0.2 * d, 0.07), (0.85 * w, 0.8 * d, 0.085), texture(rng, "checker", 9.0)),
+        board((-0.25 * w, -0.85 * d, 0.07), (0.25 * w, -0.35 * d, 0.078), texture(rng, "plain")),
     ]
     screen = [
-        _board((-w, -d, 0.09), (w, d, 0.14), replace(shell, seed=shell.seed + 1)),
-        _board((-0.9 * w, -0.85 * d, 0.082), (0.9 * w, 0.85 * d, 0.09), _texture(rng, "stripes", 3.0)),
+        board((-w, -d, 0.09), (w, d, 0.14), replace(shell, seed=shell.seed + 1)),
+        board((-0.9 * w, -0.85 * d, 0.082), (0.9 * w, 0.85 * d, 0.09), texture(rng, "stripes", 3.0)),
     ]
-    joint = _hinge((-1, 0, 0), (0, d, 0.09), 40.0, rng.uniform(100, 115))
-    return KnownObject("laptop", (KnownPart("base", tuple(base)), _opened("screen", screen, joint)))
+    joint = hinge((-1, 0, 0), (0, d, 0.09), 40.0, rng.uniform(100, 115))
+    return KnownObject("laptop", (KnownPart("base", tuple(base)), opened("screen", screen, joint)))
 
 
 def _slider(rng: np.random.Generator) -> KnownObject:
     """A carriage on a rail, in plain sight in both states."""
-    rail, stop = _texture(rng, "stripes", 4.0), _texture(rng, "checker", 6.0)
+    rail, stop = texture(rng, "stripes", 4.0), texture(rng, "checker", 6.0)
     base = [
-        _board((-1, -0.25, 0), (1, 0.25, 0.1), rail),
-        _board((-1, -0.06, 0.1), (1, 0.06, 0.2), _texture(rng, "wood")),
-        _board((-1, -0.2, 0.1), (-0.94, 0.2, 0.4), stop),
-        _board((0.94, -0.2, 0.1), (1, 0.2, 0.4), stop),
+        board((-1, -0.25, 0), (1, 0.25, 0.1), rail),
+        board((-1, -0.06, 0.1), (1, 0.06, 0.2), texture(rng, "wood")),
+        board((-1, -0.2, 0.1), (-0.94, 0.2, 0.4), stop),
+        board((0.94, -0.2, 0.1), (1, 0.2, 0.4), stop),
     ]
     half, height = rng.uniform(0.18, 0.25), rng.uniform(0.45, 0.6)
     carriage = [
-        _board((-0.9, -0.22, 0.21), (-0.9 + 2 * half, 0.22, height), _texture(rng, "checker", 5.0)),
-        _board((-0.85, -0.08, height), (-0.9 + 1.4 * half, 0.08, height + 0.15), _texture(rng, "noise")),
+        board((-0.9, -0.22, 0.21), (-0.9 + 2 * half, 0.22, height), texture(rng, "checker", 5.0)),
+        board((-0.85, -0.08, height), (-0.9 + 1.4 * half, 0.08, height + 0.15), texture(rng, "noise")),
     ]
     joint = TrueJoint("prismatic", (1.0, 0.0, 0.0), (0.0, 0.0, 0.2), 0.0, rng.uniform(0.7, 0.9))
     return KnownObject("slider", (KnownPart("base", tuple(base)), KnownPart("carriage", tuple(carriage), joint)))
@@ -126,59 +123,43 @@ def _slider(rng: np.random.Generator) -> KnownObject:
 
 def _stapler(rng: np.random.Generator) -> KnownObject:
     """An arm that reaches across its hinge to both sides."""
-    length, metal = rng.uniform(0.95, 1.15), _texture(rng, "plain")
+    length, metal = rng.uniform(0.95, 1.15), texture(rng, "plain")
     base = [
-        _board((-0.2, -length, 0), (0.2, 0.35, 0.08), _texture(rng, "checker", 5.0)),
-        _board((-0.2, -0.12, 0.08), (-0.14, 0.12, 0.46), metal),
-        _board((0.14, -0.12, 0.08), (0.2, 0.12, 0.46), metal),
+        board((-0.2, -length, 0), (0.2, 0.35, 0.08), texture(rng, "checker", 5.0)),
+        board((-0.2, -0.12, 0.08), (-0.14, 0.12, 0.46), metal),
+        board((0.14, -0.12, 0.08), (0.2, 0.12, 0.46), metal),
     ]
     arm = [
-        _board((-0.13, -length, 0.27), (0.13, 0.2, 0.42), _texture(rng, "stripes", 5.0)),
-        _board((-0.08, -0.97 * length, 0.22), (0.08, -0.2, 0.27), _texture(rng, "noise")),
+        board((-0.13, -length, 0.27), (0.13, 0.2, 0.42), texture(rng, "stripes", 5.0)),
+        board((-0.08, -0.97 * length, 0.22), (0.08, -0.2, 0.27), texture(rng, "noise")),
     ]
-    joint = _hinge((-1, 0, 0), (0, 0, 0.34), 5.0, rng.uniform(40, 50))
-    return KnownObject("stapler", (KnownPart("base", tuple(base)), _opened("arm", arm, joint)))
+    joint = hinge((-1, 0, 0), (0, 0, 0.34), 5.0, rng.uniform(40, 50))
+    return KnownObject("stapler", (KnownPart("base", tuple(base)), opened("arm", arm, joint)))
 
 
 def _chest(rng: np.random.Generator) -> KnownObject:
     """A chest with a hollow lid, ajar in state 0."""
     w, d, h, t = rng.uniform(0.7, 0.85), rng.uniform(0.42, 0.5), rng.uniform(0.5, 0.65), _BOARD
-    wood, lid = _texture(rng, "wood"), _texture(rng, "stripes", 3.0)
-    joint = _hinge((-1, 0, 0), (0, d, h), 15.0, rng.uniform(70, 85))
-    base = [_board((-w, -d, 0), (w, d, t), wood), *_walls((-w, -d, t), (w, d, h), t, wood)]
+    wood, lid = texture(rng, "wood"), texture(rng, "stripes", 3.0)
+    joint = hinge((-1, 0, 0), (0, d, h), 15.0, rng.uniform(70, 85))
+    base = [board((-w, -d, 0), (w, d, t), wood), *walls((-w, -d, t), (w, d, h), t, wood)]
     top = h + 0.2
-    cover = [_board((-w, -d, top), (w, d, top + t), lid), *_walls((-w, -d, h + 0.005), (w, d, top), t, lid)]
-    cover.append(_board((-0.1, -d - 0.04, h + 0.03), (0.1, -d, h + 0.12), _texture(rng, "plain")))
-    return KnownObject("chest", (KnownPart("base", tuple(base)), _opened("lid", cover, joint)))
-
-
-def _switch(rng: np.random.Generator) -> KnownObject:
-    """A rocker between two rails on a plate: it tips a little about its middle, and either end hides what the other shows."""
-    base = [
-        _board((-0.6, -0.05, -0.9), (0.6, 0.05, 0.9), _texture(rng, "noise")),
-        _board((-0.4, -0.1, -0.6), (-0.3, -0.05, 0.6), _texture(rng, "plain")),
-        _board((0.3, -0.1, -0.6), (0.4, -0.05, 0.6), _texture(rng, "plain")),
-        _board((-0.28, -0.14, -0.06), (0.28, -0.05, 0.06), _texture(rng, "plain")),
-    ]
-    rocker = _board((-0.28, -0.28, -0.5), (0.28, -0.16, 0.5), _texture(rng, "checker", 5.0))
-    tip = rng.uniform(7, 9)
-    joint = _hinge((1, 0, 0), (0, -0.16, 0), -tip, tip)
-    return KnownObject("switch", (KnownPart("base", tuple(base)), _opened("rocker", [rocker], joint)))
+    cover = [board((-w, -d, top), (w, d, top + t), lid), *walls((-w, -d, h + 0.005), (w, d, top), t, lid)]
+    cover.append(board((-0.1, -d - 0.04, h + 0.03), (0.1, -d, h + 0.12), texture(rng, "plain")))
+    return KnownObject("chest", (KnownPart("base", tuple(base)), opened("lid", cover, joint)))
 
 
 def _static(rng: np.random.Generator) -> KnownObject:
     """A stool: nothing moves."""
-    legs = _texture(rng, "wood")
-    boxes = [_board((-0.6, -0.5, 0.7), (0.6, 0.5, 0.8), _texture(rng, "checker", 3.0))]
-    boxes += [_board((x - 0.06, y - 0.06, 0), (x + 0.06, y + 0.06, 0.7), legs) for x in (-0.5, 0.5) for y in (-0.4, 0.4)]
+    legs = texture(rng, "wood")
+    boxes = [board((-0.6, -0.5, 0.7), (0.6, 0.5, 0.8), texture(rng, "checker", 3.0))]
+    boxes += [board((x - 0.06, y - 0.06, 0), (x + 0.06, y + 0.06, 0.7), legs) for x in (-0.5, 0.5) for y in (-0.4, 0.4)]
     return KnownObject("static", (KnownPart("base", tuple(boxes)),))
 
 
 def _block(rng: np.random.Generator) -> KnownObject:
     """One convex block: nothing moves."""
-    return KnownObject(
-        "block", (KnownPart("base", (_board((-0.6, -0.4, 0), (0.6, 0.4, 0.5), _texture(rng, "checker", 3.0)),)),)
-    )
+    return KnownObject("block", (KnownPart("base", (board((-0.6, -0.4, 0), (0.6, 0.4, 0.5), texture(rng, "checker", 3.0)),)),))
 
 
 OBJECTS: dict[str, Callable[[np.random.Generator], KnownObject]] = {
@@ -187,12 +168,12 @@ OBJECTS: dict[str, Callable[[np.random.Generator], KnownObject]] = {
     "slider": _slider,
     "stapler": _stapler,
     "chest": _chest,
-    "switch": _switch,
     "fridge": _fridge,
     "door": _door,
     "drawer": _drawer,
     "static": _static,
     "block": _block,
+    **THINGS,
 }
 
 
@@ -207,17 +188,17 @@ def _cupboard(
 ) -> KnownObject:
     """A cupboard of compartments in rows from below, whose heights have the given shares (default: equal)."""
     t, w, d = _BOARD, width / 2, depth / 2
-    body = _texture(rng, "wood")
-    shell = [_board((-w, -d, 0), (w, d, t), body), _board((-w, -d, height - t), (w, d, height), body)]
-    shell += _walls((-w, -d, t), (w, d, height - t), t, body)[1:]
+    body = texture(rng, "wood")
+    shell = [board((-w, -d, 0), (w, d, t), body), board((-w, -d, height - t), (w, d, height), body)]
+    shell += walls((-w, -d, t), (w, d, height - t), t, body)[1:]
     levels = t + (height - 2 * t) * np.cumsum([0, *(shares or [1 / len(rows)] * len(rows))])
     parts = []
     for i, row in enumerate(rows):
         low, high = float(levels[i]), float(levels[i + 1])
         if i:
-            shell.append(_board((t - w, -d, low - t / 2), (w - t, d - t, low + t / 2), body))
+            shell.append(board((t - w, -d, low - t / 2), (w - t, d - t, low + t / 2), body))
         sides = np.linspace(-w, w, len(row) + 1)
-        shell += [_board((x - t / 2, -d, low + t / 2), (x + t / 2, d - t, high - t / 2), body) for x in sides[1:-1]]
+        shell += [board((x - t / 2, -d, low + t / 2), (x + t / 2, d - t, high - t / 2), body) for x in sides[1:-1]]
         for j, front in enumerate(row):
             if front.kind != "open":
                 corners = ((float(sides[j]), -d, low), (float(sides[j + 1]), d - t, high))
@@ -225,73 +206,33 @@ def _cupboard(
     return KnownObject(name, (KnownPart("base", tuple(shell)), *parts))
 
 
-def _make_door(front: Front, low: _Point, high: _Point, rng: np.random.Generator) -> KnownPart:
+def _make_door(front: Front, low: Point, high: Point, rng: np.random.Generator) -> KnownPart:
     """A slab with a handle before the compartment between two corners, hinged at the edge that touches the body."""
-    slab = _front_slab(low, high, _texture(rng))
+    slab = _front_slab(low, high, texture(rng))
     left = front.hinge == "left"
-    hinge = low[0] + _GAP if left else high[0] - _GAP
+    edge = low[0] + _GAP if left else high[0] - _GAP
     free = high[0] - 0.1 if left else low[0] + 0.1
     middle, face = (low[2] + high[2]) / 2, low[1] - _BOARD
-    handle = _board((free - 0.025, face - 0.05, middle - 0.12), (free + 0.025, face, middle + 0.12), _texture(rng, "plain"))
-    joint = _hinge((0, 0, -1) if left else (0, 0, 1), (hinge, low[1], middle), front.q0, front.q1)
-    return _opened("door", [slab, handle], joint)
+    handle = board((free - 0.025, face - 0.05, middle - 0.12), (free + 0.025, face, middle + 0.12), texture(rng, "plain"))
+    joint = hinge((0, 0, -1) if left else (0, 0, 1), (edge, low[1], middle), front.q0, front.q1)
+    return opened("door", [slab, handle], joint)
 
 
-def _make_drawer(front: Front, low: _Point, high: _Point, rng: np.random.Generator) -> KnownPart:
+def _make_drawer(front: Front, low: Point, high: Point, rng: np.random.Generator) -> KnownPart:
     """A slab with a handle and an open tray behind it."""
-    slab = _front_slab(low, high, _texture(rng))
+    slab = _front_slab(low, high, texture(rng))
     middle, level, face = (low[0] + high[0]) / 2, (low[2] + high[2]) / 2, low[1] - _BOARD
-    handle = _board((middle - 0.12, face - 0.05, level - 0.025), (middle + 0.12, face, level + 0.025), _texture(rng, "plain"))
+    handle = board((middle - 0.12, face - 0.05, level - 0.025), (middle + 0.12, face, level + 0.025), texture(rng, "plain"))
     inside, t = _BOARD + _GAP, 0.03
     length = 0.92 * (high[1] - low[1])
     a = (low[0] + inside, low[1], low[2] + inside)
     b = (high[0] - inside, low[1] + length, low[2] + 0.75 * (high[2] - low[2]))
-    wood = _texture(rng, "wood")
-    tray = [_board(a, (b[0], b[1], a[2] + t), wood), *_walls((a[0], a[1], a[2] + t), b, t, wood)[1:]]
+    wood = texture(rng, "wood")
+    tray = [board(a, (b[0], b[1], a[2] + t), wood), *walls((a[0], a[1], a[2] + t), b, t, wood)[1:]]
     joint = TrueJoint("prismatic", (0.0, -1.0, 0.0), (middle, low[1], level), front.q0 * length, front.q1 * length)
-    return _opened("drawer", [slab, handle, *tray], joint)
+    return opened("drawer", [slab, handle, *tray], joint)
 
 
-def _front_slab(low: _Point, high: _Point, texture: Texture) -> TexturedBox:
+def _front_slab(low: Point, high: Point, texture: Texture) -> TexturedBox:
     """The board before a compartment; it overlaps the frame and leaves a gap to its neighbours."""
-    return _board((low[0] + _GAP, low[1] - _BOARD, low[2] + _GAP), (high[0] - _GAP, low[1], high[2] - _GAP), texture)
-
-
-def _walls(low: _Point, high: _Point, t: float, texture: Texture) -> list[TexturedBox]:
-    """Front, back, left and right walls of thickness `t` inside a box."""
-    (a, b, c), (x, y, z) = low, high
-    return [
-        _board((a + t, b, c), (x - t, b + t, z), texture),
-        _board((a + t, y - t, c), (x - t, y, z), texture),
-        _board((a, b, c), (a + t, y, z), texture),
-        _board((x - t, b, c), (x, y, z), texture),
-    ]
-
-
-def _hinge(axis: _Point, origin: _Point, q0_deg: float, q1_deg: float) -> TrueJoint:
-    (x, y, z), (a, b, c) = map(float, axis), map(float, origin)
-    return TrueJoint("revolute", (x, y, z), (a, b, c), math.radians(q0_deg), math.radians(q1_deg))
-
-
-def _opened(name: str, boxes: Sequence[TexturedBox], joint: TrueJoint) -> KnownPart:
-    """A part of boxes that are given shut, opened to the joint's value in state 0."""
-    to_state_0 = replace(joint, q0=0.0, q1=joint.q0).motion()
-    return KnownPart(name, tuple(box.moved(to_state_0) for box in boxes), joint)
-
-
-def _board(low: _Point, high: _Point, texture: Texture) -> TexturedBox:
-    """The box between two corners."""
-    a, b = (torch.tensor(corner, dtype=torch.float64) for corner in (low, high))
-    eye = torch.eye(3, dtype=torch.float64)
-    x, y, z = ((a + b) / 2).tolist()
-    return TexturedBox(Box(SE3.from_rotation(eye, (a + b) / 2), (b - a) / 2), texture, (x, y, z))
-
-
-def _texture(rng: np.random.Generator, kind: TextureKind | None = None, frequency: float = 4.0) -> Texture:
-    """A texture of a random hue and, where none is given, of a random kind."""
-    kinds: list[TextureKind] = ["stripes", "checker", "wood", "noise"]
-    chosen = kinds[rng.integers(len(kinds))] if kind is None else kind
-    hue = rng.uniform(0.03, 0.1) if chosen == "wood" else rng.random()
-    light = colorsys.hsv_to_rgb(hue, rng.uniform(0.25, 0.6), rng.uniform(0.8, 0.95))
-    dark = colorsys.hsv_to_rgb((hue + rng.uniform(-0.08, 0.08)) % 1, rng.uniform(0.5, 0.8), rng.uniform(0.4, 0.6))
-    return Texture(chosen, light, dark, frequency * rng.uniform(0.85, 1.15), int(rng.integers(1 << 16)))
+    return board((low[0] + _GAP, low[1] - _BOARD, low[2] + _GAP), (high[0] - _GAP, low[1], high[2] - _GAP), texture)
