@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from structuregs.capture import Capture, stack_views
-from structuregs.fit.evidence import seen_in_both, shown
-from structuregs.geometry import SE3, Box
+from structuregs.capture import Capture, View, stack_views
+from structuregs.fit.evidence import covered_in_both, seen_in_both, shown
+from structuregs.geometry import SE3, Box, Camera
 from structuregs.joints import articulate
 from structuregs.model import ArticulatedObject, PosedParts, Splats
 from structuregs.raster import coverage_of, painted, render
@@ -74,6 +75,42 @@ def test_an_older_doubt_is_kept(capture: Capture):
     (joint,) = seen_in_both(doubtful, capture).joints
     assert joint.confidence < 0.1
     assert joint.review == "Older."
+
+
+def two_balls(*out: float) -> ArticulatedObject:
+    """Balls above and below a box, which go so far along x from state 0 to state 1."""
+    places = torch.tensor([[0.0, 0, 0], [0, 0.8, 0], [0, -0.8, 0]])
+    upright = torch.tensor([1.0, 0, 0, 0]).repeat(3, 1)
+    boxes = Box(SE3.from_quat(upright, places), torch.tensor([[0.3, 0.3, 0.3], [0.15, 0.15, 0.15], [0.15, 0.15, 0.15]]))
+    motions = SE3.from_quat(upright, torch.tensor([[0.0, 0, 0], [out[0], 0, 0], [out[1], 0, 0]]))
+    shell = blobs(walls(), 0.03)
+    splats = Splats.concatenate([shell] * 3)
+    return articulate(PosedParts(boxes, motions, splats, (len(shell),) * 3, torch.zeros(len(splats), 3)))
+
+
+def photographed(obj: ArticulatedObject) -> Capture:
+    """Six photos of either state from around, and above and below."""
+    states = []
+    for state in (0, 1):
+        views = []
+        for k in range(6):
+            turn = SE3.exp(torch.tensor([0.0, 0, 0, 0.4 * (-1) ** k, math.pi * k / 3, 0]))
+            camera = Camera(turn @ SE3.exp(torch.tensor([0.0, 0, -4, 0, 0, 0])), 100.0, 100.0, 48.0, 48.0, 96, 96)
+            image = render(obj.parts.at_state(state), camera)
+            rgba = (255 * torch.cat([image.rgb.clamp(0, 1), image.alpha[..., None]], -1)).round().byte().numpy()
+            views.append(View(f"{k:04d}", camera, rgba))
+        states.append(tuple(views))
+    return Capture("made", Path("made"), (states[0], states[1]), ((), ()), "memory")
+
+
+def test_a_part_is_doubted_where_photos_beside_it_show_what_nothing_covers():
+    photos = photographed(two_balls(0.7, 0.6))
+    right, short = covered_in_both(two_balls(0.7, 0.6), photos).joints, covered_in_both(two_balls(0.7, 0.2), photos).joints
+    assert [joint.confidence for joint in right] == [1, 1]
+    assert [joint.review for joint in right] == ["", ""]
+    assert short[0].confidence == 1
+    assert short[1].confidence < 0.5
+    assert short[1].review.startswith("Beside the part, photos of state 1 show what nothing covers (")
 
 
 def test_what_some_splats_cover_and_what_the_others_do_adds_up_to_the_picture_s_coverage(capture: Capture):
