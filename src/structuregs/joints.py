@@ -61,7 +61,8 @@ def joints_of(parts: PosedParts, kinds: Sequence[JointKind] | None = None) -> tu
       the box, 0 from `3 r` on, where a slide looks the same;
     - splats: the sum of the part's opacities, over 100.
 
-    After a fit it is lowered further where photos hardly show the part, or not alike (`structuregs.fit.evidence`).
+    After a fit it is lowered further where photos hardly show the part, not alike, or beside it what nothing covers
+    (`structuregs.fit.evidence`).
 
     `review` is the sentence of the lowest score where the confidence is below `REVIEW_BELOW`.
 
