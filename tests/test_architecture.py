@@ -14,6 +14,7 @@ PACKAGE = Path(structuregs.__file__).parent
 
 # A room imports only rooms of lower levels; the two doors may import all of them.
 LEVELS = {
+    "files": 0,
     "geometry": 0,
     "jit": 0,
     "model": 1,

@@ -151,7 +151,7 @@ class TestRunning:
             ("7", 1, False),
         ]
         assert all("there is no such folder" in row.error for row in rows if row.report is None)
-        assert not list(tmp_path.rglob("*.part"))
+        assert not list(tmp_path.rglob("*.part*"))
 
     def test_what_an_older_version_scored_is_scored_again(self, tmp_path):
         """Its report does not say which parts are flagged; the capture does not exist, so that scoring it again fails."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..export.assets import replace_file
+from ..files import replace_file
 from .report import Report
 
 _COMMAND = (sys.executable, "-c", "from structuregs.cli import main; main()")

@@ -9,8 +9,8 @@ from typing import Any
 import trimesh
 
 from ..capture import Capture, Truth, find_truth, load_capture, load_truth
-from ..export.assets import replace_file
 from ..export.mesh import part_meshes
+from ..files import replace_file
 from ..fit.run import RunFolder
 from ..model import ArticulatedObject, load_object
 from .images import psnr_on_views

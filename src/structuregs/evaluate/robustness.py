@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from ..boxes import CueConfig, StateLook, clusters, survey
 from ..capture import Capture
-from ..export.assets import replace_file
+from ..files import replace_file
 from ..fit.schedule import FitConfig
 from .setting import Setting
 

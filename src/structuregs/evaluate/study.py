@@ -6,11 +6,11 @@ from html import escape
 from pathlib import Path
 
 from ..capture import Capture, Truth
-from ..export.assets import replace_file
 from ..export.chart import curves_chart
 from ..export.overlay import draw_error_maps, draw_structure
 from ..export.page import image_bytes, plain_page, png_url
 from ..export.report import loss_points
+from ..files import replace_file
 from ..fit.events import Finished, FitEvent, Preview, Step
 from ..fit.reconstruct import fit_run
 from ..fit.run import RunFolder

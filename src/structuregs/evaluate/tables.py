@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from ..export.assets import replace_file
+from ..files import replace_file
 from .bench import Bench, BenchRow
 
 METRICS = ("Ang Err", "Pos Err", "Geo Dist", "CD-s", "CD-m", "CD-w")

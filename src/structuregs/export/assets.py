@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 
+from ..files import replace_file
 from .links import Mechanism
 
 _GREY = (0.7, 0.7, 0.7, 1.0)
@@ -24,14 +25,6 @@ def checked_name(name: str) -> str:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"{name!r}: a model's name begins with a letter and holds only A-Z, a-z, 0-9 and _; choose another.")
     return name
-
-
-def replace_file(path: Path, content: str | bytes) -> Path:
-    """Writes a file aside, then into place, and makes its folders; returns its path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    staged = path.with_name(path.name + ".part")
-    staged.write_bytes(content.encode() if isinstance(content, str) else content)
-    return staged.replace(path)
 
 
 def number(value: float) -> str:

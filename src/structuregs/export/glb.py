@@ -13,8 +13,8 @@ import trimesh
 from jaxtyping import Float, UInt16
 from trimesh.visual import ColorVisuals, TextureVisuals
 
+from ..files import replace_file
 from ..model import ArticulatedObject, Splats
-from .assets import replace_file
 from .sweep import sweep_values
 
 _FRAMES = 48  # keys of the way there and back

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float, Float32, UInt16
 from torch import Tensor
 
+from ..files import replace_file
 from ..geometry import SE3, Camera
 from ..model import ArticulatedObject, Splats
-from .assets import replace_file
 from .overlay import colour_of, joint_strokes
 from .page import filled, page_file
 from .sweep import telling_order

@@ -14,10 +14,11 @@ from scipy.sparse.csgraph import connected_components
 from trimesh.visual import ColorVisuals
 
 from ..capture import Capture, ImageStack, stack_views
+from ..files import replace_file
 from ..geometry import SE3, Box, Camera
 from ..model import ArticulatedObject, Splats
 from ..raster import render_surface
-from .assets import replace_file, write_visual
+from .assets import write_visual
 from .texture import textured
 from .tsdf import Volume
 

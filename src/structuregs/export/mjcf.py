@@ -6,8 +6,9 @@ from xml.etree import ElementTree
 
 import trimesh
 
+from ..files import replace_file
 from ..model import ArticulatedObject
-from .assets import checked_name, collision_name, mean_colour, number, numbers, replace_file, texture_of, write_meshes
+from .assets import checked_name, collision_name, mean_colour, number, numbers, texture_of, write_meshes
 from .links import Link, LinkJoint, Mechanism, mechanism_of
 
 _MESHES = "meshes"

@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from ..capture import Capture, View, spread_cameras, stack_views
+from ..files import replacing
 from ..fit.structure import structure_images, union
 from ..geometry import Box, Camera
 from ..model import ArticulatedObject, Joint
@@ -50,9 +51,8 @@ def draw_structure(capture: Capture, obj: ArticulatedObject, *, columns: int = 3
 
 def write_structure(capture: Capture, obj: ArticulatedObject, file: Path) -> None:
     """Writes `draw_structure` as a PNG, aside and then into place."""
-    staged = file.with_name(file.name + ".part")
-    draw_structure(capture, obj).save(staged, format="PNG")
-    staged.replace(file)
+    with replacing(file) as staged:
+        draw_structure(capture, obj).save(staged, format="PNG")
 
 
 def draw_error_maps(capture: Capture, obj: ArticulatedObject, *, size: int = 220) -> Image.Image:

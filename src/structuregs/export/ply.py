@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..files import replace_file
 from ..model import ArticulatedObject, Splats
-from .assets import replace_file
 
 
 def export_ply(obj: ArticulatedObject, folder: Path) -> list[Path]:

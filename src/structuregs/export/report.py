@@ -14,12 +14,12 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from ..capture import Capture, View, spread_cameras, stack_views
+from ..files import replace_file
 from ..fit.run import RunFolder
 from ..geometry import Camera
 from ..metrics import psnr
 from ..model import ArticulatedObject, Joint, Splats
 from ..raster import render
-from .assets import replace_file
 from .chart import Point, line_chart
 from .html import opening_camera
 from .overlay import colour_of, draw_structure

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
+from ..files import replacing
 from ..geometry import Camera
 from ..model import ArticulatedObject, Joint, Splats
 from ..raster import render
@@ -91,9 +92,8 @@ def _picture(splats: Splats, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _save(image: Image.Image, path: Path, kind: str, **options: object) -> Path:
-    staged = path.with_name(path.name + ".part")
-    image.save(staged, format=kind, **options)
-    staged.replace(path)
+    with replacing(path) as staged:
+        image.save(staged, format=kind, **options)
     return path
 
 
@@ -106,9 +106,8 @@ def _save_film(pictures: Iterable[UInt8[np.ndarray, "H W 3"]], camera: Camera, p
         raise ValueError(
             f"{path}: an .mp4 needs the package av; install it with `pip install 'structuregs[video]'`."
         ) from error
-    staged = path.with_name(path.name + ".part")
     grown = ((0, camera.height % 2), (0, camera.width % 2), (0, 0))
-    with av.open(staged, "w", format="mp4") as film:
+    with replacing(path) as staged, av.open(staged, "w", format="mp4") as film:
         stream = film.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000), options={"crf": "18"})
         stream.pix_fmt = "yuv420p"
         stream.width, stream.height = camera.width + camera.width % 2, camera.height + camera.height % 2
@@ -120,5 +119,4 @@ def _save_film(pictures: Iterable[UInt8[np.ndarray, "H W 3"]], camera: Camera, p
             frame = av.VideoFrame.from_ndarray(np.pad(picture, grown, mode="edge"), format="rgb24")
             film.mux(stream.encode(frame))
         film.mux(stream.encode())
-    staged.replace(path)
     return path

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 import trimesh
 
+from ..files import replace_file, replacing
 from ..geometry import SE3
 from ..model import ArticulatedObject, Splats
-from .assets import checked_name, collision_name, mean_colour, png_bytes, replace_file, texture_of, uv_of, vertex_rgb
+from .assets import checked_name, collision_name, mean_colour, png_bytes, texture_of, uv_of, vertex_rgb
 from .links import Link, LinkJoint, Mechanism, mechanism_of
 
 _TEXTURES = "textures"
@@ -83,11 +84,11 @@ def write_usd(obj: ArticulatedObject, mechanism: Mechanism, folder: Path, *, nam
     for joint in mechanism.joints:
         _add_joint(stage, f"/{name}", joint, mechanism)
     UsdPhysics.Scene.Define(stage, "/physicsScene")
-    folder.mkdir(parents=True, exist_ok=True)
-    staged = folder / f"{name}.part.usdc"
-    if not layer.Export(str(staged)):
-        raise OSError(f"{staged}: USD could not write this file.")
-    return staged.replace(folder / f"{name}.usdc")
+    file = folder / f"{name}.usdc"
+    with replacing(file) as staged:
+        if not layer.Export(str(staged)):
+            raise OSError(f"{staged}: USD could not write this file.")
+    return file
 
 
 def _require_usd() -> None:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capture import Capture, ImageStack, stack_views
+from ..files import replacing
 from ..geometry import SE3, Camera, JointKind
 from ..joints import kind_of
 from ..model import PosedParts, Splats
@@ -98,9 +99,8 @@ class FitState:
             "turns": self.turns,
             "anew": self.anew,
         }
-        staged = file.with_name(file.name + ".part")
-        torch.save(record, staged)
-        staged.replace(file)
+        with replacing(file) as staged:
+            torch.save(record, staged)
 
     @staticmethod
     def load(file: Path, device: torch.device | None = None) -> "FitState":

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..capture import Capture
+from ..files import replace_file
 from .events import Step
 
 
@@ -65,8 +66,7 @@ class RunFolder:
         if not self.config.exists():
             if self.root.exists() and any(p.name != "capture" for p in self.root.iterdir()):
                 raise ValueError(f"{self.root}: the folder is not empty and holds no run; choose another with -o.")
-            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            _write(self.config, json.dumps(record, indent=1) + "\n")
+            replace_file(self.config, json.dumps(record, indent=1) + "\n")
             return
         try:
             before = json.loads(self.config.read_text())
@@ -108,7 +108,7 @@ class RunFolder:
             {view.name: turn for view, turn in zip(views, state.tolist(), strict=True)}
             for views, state in zip(capture.train, turns, strict=True)
         ]
-        _write(self.cameras, json.dumps({"turns": states}, indent=1) + "\n")
+        replace_file(self.cameras, json.dumps({"turns": states}, indent=1) + "\n")
         degrees = float(torch.cat(list(turns)).norm(dim=-1).median().rad2deg())
         note = f"cameras pointed {degrees:.2f} degrees beside their photos (median) and were turned"
         self.keep_sentences(list(dict.fromkeys([*self.sentences(), note])))
@@ -119,7 +119,7 @@ class RunFolder:
 
     def keep_sentences(self, sentences: Sequence[str]) -> None:
         """Writes `notes`."""
-        _write(self.notes, "".join(f"{sentence}\n" for sentence in sentences))
+        replace_file(self.notes, "".join(f"{sentence}\n" for sentence in sentences))
 
     def records(self) -> list[dict[str, Any]]:
         """The records of `metrics`, step by step; none where it is not there."""
@@ -134,19 +134,12 @@ class RunFolder:
         """Drops the records of steps after `step`, which a run that goes on will write again."""
         if self.metrics.exists():
             lines = [line for line in self.metrics.read_text().splitlines(keepends=True) if line.endswith("\n")]
-            _write(self.metrics, "".join(line for line in lines if json.loads(line)["step"] <= step))
+            replace_file(self.metrics, "".join(line for line in lines if json.loads(line)["step"] <= step))
 
 
 def _plain(value: object) -> object:
     """A value as JSON gives it back."""
     return json.loads(json.dumps(value))
-
-
-def _write(file: Path, text: str) -> None:
-    """Writes a file aside and renames it into place."""
-    staged = file.with_name(file.name + ".part")
-    staged.write_text(text)
-    staged.replace(file)
 
 
 class Clock:
@@ -157,4 +150,4 @@ class Clock:
 
     def save(self) -> None:
         """Writes the total so far."""
-        _write(self.file, json.dumps({"total": round(self.before + time.monotonic() - self.began, 2)}) + "\n")
+        replace_file(self.file, json.dumps({"total": round(self.before + time.monotonic() - self.began, 2)}) + "\n")

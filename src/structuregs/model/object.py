@@ -10,6 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from ..files import replace_file, replacing
 from ..geometry import SE3, Box
 from .joint import Joint
 from .parts import PosedParts
@@ -51,7 +52,6 @@ class ArticulatedObject:
 
 def save_object(obj: ArticulatedObject, folder: Path) -> None:
     """Writes `object.json` and `splats.safetensors` into a folder (see docs/format.md); both are renamed into place."""
-    folder.mkdir(parents=True, exist_ok=True)
     parts = obj.parts
     tensors = {name: value.contiguous() for name, value in parts.splats.tensors().items()} | {"tint": parts.tint.contiguous()}
     record = {
@@ -71,12 +71,9 @@ def save_object(obj: ArticulatedObject, folder: Path) -> None:
         ],
         "joints": [asdict(joint) for joint in obj.joints],
     }
-    staged = folder / "splats.safetensors.part"
-    save_file(tensors, staged)
-    staged.replace(folder / "splats.safetensors")
-    staged = folder / "object.json.part"
-    staged.write_text(json.dumps(record, indent=1) + "\n")
-    staged.replace(folder / "object.json")
+    with replacing(folder / "splats.safetensors") as staged:
+        save_file(tensors, staged)
+    replace_file(folder / "object.json", json.dumps(record, indent=1) + "\n")
 
 
 def load_object(folder: Path) -> ArticulatedObject:
