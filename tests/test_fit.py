@@ -10,7 +10,7 @@ from torch import Tensor
 
 from door_and_drawer import DOOR, DRAWER, made_of, photographed
 from structuregs.capture import stack_views
-from structuregs.fit.boxes import base_tightened, squared_up, tightened
+from structuregs.fit.boxes import base_tightened, drawn_out, squared_up, tightened
 from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
 from structuregs.fit.loop import FitState, Fitter, askew
@@ -606,6 +606,23 @@ class TestResult:
         torch.testing.assert_close(tight.boxes.half_extents[1:], shrunk.boxes.half_extents[1:])
         for state in (0, 1):
             same_splats(tight.at_state(state), shrunk.at_state(state))
+
+    def test_boxes_of_what_moves_are_drawn_out_to_splats_that_stick_out(self):
+        """Along one axis the door's splats reach half as far again as its box; along another they fill half of it."""
+        parts = turned_parts()
+        rows = parts.part == 1
+        means = parts.splats.means.clone()
+        means[rows] *= torch.tensor([1.5, 0.5, 1.0])
+        out = replace(parts, splats=replace(parts.splats, means=means, logit_opacities=torch.full_like(means[:, 0], 3.0)))
+        drawn = drawn_out(out)
+        reach = means[rows][:, 0].abs().max() * parts.boxes.half_extents[1, 0]
+        torch.testing.assert_close(drawn.boxes.half_extents[1, 0], reach, rtol=0.03, atol=0)
+        torch.testing.assert_close(drawn.boxes.half_extents[1, 1:], parts.boxes.half_extents[1, 1:], rtol=0.03, atol=0)
+        torch.testing.assert_close(drawn.boxes.half_extents[0], parts.boxes.half_extents[0])
+        for state in (0, 1):
+            same_splats(drawn.at_state(state), out.at_state(state))
+        faint = replace(out, splats=replace(out.splats, logit_opacities=torch.full_like(means[:, 0], -3.0)))
+        torch.testing.assert_close(drawn_out(faint).boxes.half_extents, parts.boxes.half_extents)
 
     def test_boxes_are_turned_along_the_faces_of_their_splats(self):
         """Splats on the faces of the boxes; each box is then put askew, and comes back."""

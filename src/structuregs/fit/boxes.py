@@ -30,6 +30,18 @@ def base_tightened(parts: PosedParts) -> PosedParts:
     return parts.in_box(0, _tight(parts, 0))
 
 
+def drawn_out(parts: PosedParts) -> PosedParts:
+    """The same with the boxes of what moves made to hold their opaque splats too, where these stick out.
+
+    Splats that grew beyond what the search found of a part, such as a handle's or a blade's tip, then have room to go on.
+    """
+    parts = parts.detach()
+    for k in range(1, len(parts)):
+        corners = torch.cat([parts.boxes[k].corners, _tight(parts, k).corners])
+        parts = parts.in_box(k, Box.around(corners, parts.boxes.T_world_box.rotation[k]))
+    return parts
+
+
 def squared_up(parts: PosedParts) -> PosedParts:
     """The same splats in boxes of the same size and place, turned along the parts' faces, as opaque splats show them."""
     parts = parts.detach()

@@ -20,7 +20,7 @@ from ..joints import kind_of
 from ..model import PosedParts, Splats
 from ..raster import image_loss, render
 from .aim import beside, misaim, with_coverage
-from .boxes import base_tightened, object_size, squared_up
+from .boxes import base_tightened, drawn_out, object_size, squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
 from .evidence import shown
@@ -183,9 +183,12 @@ class Fitter:
 
     @torch.no_grad()
     def _square_up(self) -> None:
-        """Turns boxes along the faces of their parts: joints are drawn to the axes of the base's, which is also made tight."""
+        """Turns boxes along the faces of their parts: joints are drawn to the axes of the base's, which is also made tight.
+
+        What moves has its boxes drawn out instead, to where its splats have grown.
+        """
         leaves = self.state.variables.leaves
-        for name, value in Variables.of(base_tightened(squared_up(self.state.variables.parts()))).leaves.items():
+        for name, value in Variables.of(drawn_out(base_tightened(squared_up(self.state.variables.parts())))).leaves.items():
             if name != "motions":
                 leaves[name].copy_(value)
 
