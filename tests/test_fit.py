@@ -33,6 +33,14 @@ def turned_parts() -> PosedParts:
     return replace(DOOR_AND_DRAWER, boxes=Box(pose, DOOR_AND_DRAWER.boxes.half_extents))
 
 
+def stretched(by: float) -> PosedParts:
+    """The same, all splats opaque, the door's spread evenly along its box and that much farther."""
+    parts = turned_parts()
+    means = parts.splats.means.clone()
+    means[parts.part == 1, 0] = torch.linspace(-by, by, parts.counts[1])
+    return replace(parts, splats=replace(parts.splats, means=means, logit_opacities=torch.full_like(means[:, 0], 3.0)))
+
+
 def same_motion(a: SE3, b: SE3, atol: float = 2e-6) -> None:
     torch.testing.assert_close(a.as_matrix().double(), b.as_matrix().double(), atol=atol, rtol=0)
 
@@ -607,22 +615,34 @@ class TestResult:
         for state in (0, 1):
             same_splats(tight.at_state(state), shrunk.at_state(state))
 
-    def test_boxes_of_what_moves_are_drawn_out_to_splats_that_stick_out(self):
-        """Along one axis the door's splats reach half as far again as its box; along another they fill half of it."""
-        parts = turned_parts()
-        rows = parts.part == 1
-        means = parts.splats.means.clone()
-        means[rows] *= torch.tensor([1.5, 0.5, 1.0])
-        out = replace(parts, splats=replace(parts.splats, means=means, logit_opacities=torch.full_like(means[:, 0], 3.0)))
-        drawn = drawn_out(out)
-        reach = means[rows][:, 0].abs().max() * parts.boxes.half_extents[1, 0]
-        torch.testing.assert_close(drawn.boxes.half_extents[1, 0], reach, rtol=0.03, atol=0)
-        torch.testing.assert_close(drawn.boxes.half_extents[1, 1:], parts.boxes.half_extents[1, 1:], rtol=0.03, atol=0)
-        torch.testing.assert_close(drawn.boxes.half_extents[0], parts.boxes.half_extents[0])
+    def test_boxes_of_what_moves_are_drawn_out_where_splats_press_on(self):
+        """Along one axis the door's splats lie as far as 1.7 of its box, all but two in a hundred as far as 1.632."""
+        parts = stretched(1.7)
+        slid = SE3(torch.tensor([[1.0, 0, 0, 0, 0, 0, 0], [1, 0, 0, 0, 0.3, 0, 0.1], [1, 0, 0, 0, 0, 0.2, 0]]))
+        out, half_extents = replace(parts, motions=slid), parts.boxes.half_extents
+        length = float(half_extents[1, 0])
+        drawn = drawn_out(out, 0.65 * length)
+        expected = half_extents.clone()
+        expected[1, 0] *= 1.632
+        torch.testing.assert_close(drawn.boxes.half_extents, expected)
         for state in (0, 1):
             same_splats(drawn.at_state(state), out.at_state(state))
-        faint = replace(out, splats=replace(out.splats, logit_opacities=torch.full_like(means[:, 0], -3.0)))
-        torch.testing.assert_close(drawn_out(faint).boxes.half_extents, parts.boxes.half_extents)
+
+        torch.testing.assert_close(drawn_out(out, 0.75 * length).boxes.half_extents, half_extents)
+        faint = replace(out, splats=replace(out.splats, logit_opacities=torch.full_like(out.splats.logit_opacities, -3.0)))
+        torch.testing.assert_close(drawn_out(faint, 0.65 * length).boxes.half_extents, half_extents)
+
+    def test_a_box_is_not_drawn_out_over_its_hinge(self):
+        """The splats reach beyond both ends of the box alike; only the end that the motion moves is drawn out."""
+        parts = stretched(1.7)
+        pose, half = parts.boxes.T_world_box[1], parts.boxes.half_extents[1]
+        hinge = pose.apply(half * torch.tensor([-1.4, 0.0, 0.0]))
+        motions = parts.motions.wxyz_xyz.clone()
+        motions[1] = Screw("revolute", pose.rotation[:, 2], hinge).motion(1.0).wxyz_xyz
+        drawn = drawn_out(replace(parts, motions=SE3(motions)), 0.6 * float(half[0])).boxes[1]
+        sides = drawn.half_extents * torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
+        ends = pose.inverse().apply(drawn.T_world_box.apply(sides))[:, 0]
+        torch.testing.assert_close(ends, half[0] * torch.tensor([-1.0, 1.65]), rtol=0.01, atol=0.0)
 
     def test_boxes_are_turned_along_the_faces_of_their_splats(self):
         """Splats on the faces of the boxes; each box is then put askew, and comes back."""

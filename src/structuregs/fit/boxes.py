@@ -1,6 +1,8 @@
 """Boxes that follow what their splats have become."""
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ..geometry import SE3, Box
 from ..model import PosedParts
@@ -9,6 +11,8 @@ from ..points import face_axes
 _OPAQUE = 0.3  # opacity from which a splat counts
 _ENOUGH = 10  # opaque splats that say how far a box reaches...
 _FACES = 100  # ...and so many which way it lies
+_PRESSING, _MANY = 0.9, 0.02  # of how far splats may lie outside their box: so many of them as far as that would go farther
+_STRAY = 0.002  # of a part's splats: so few may stick out of its box
 _CELL = 0.005  # of the base's longest half extent: how finely layers of splats are told apart
 
 
@@ -30,15 +34,27 @@ def base_tightened(parts: PosedParts) -> PosedParts:
     return parts.in_box(0, _tight(parts, 0))
 
 
-def drawn_out(parts: PosedParts) -> PosedParts:
-    """The same with the boxes of what moves made to hold their opaque splats too, where these stick out.
+def drawn_out(parts: PosedParts, reach: float) -> PosedParts:
+    """The same with the boxes of what moves drawn out to their opaque splats, where many of these lie as far out as they may.
 
-    Splats that grew beyond what the search found of a part, such as a handle's or a blade's tip, then have room to go on.
+    A blade's tip that the search cut off then has room to grow on.  Splats that move less than half as far as most of the part
+    do not count: beside its hinge a part hardly moves, and may paint what stands still as well.
+
+    Args:
+        parts: as fitted so far.
+        reach: how far outside their box splats may lie, world units.
     """
     parts = parts.detach()
     for k in range(1, len(parts)):
-        corners = torch.cat([parts.boxes[k].corners, _tight(parts, k).corners])
-        parts = parts.in_box(k, Box.around(corners, parts.boxes.T_world_box.rotation[k]))
+        box, opaque = parts.boxes[k], _opaque(parts, k)
+        if len(opaque) > _ENOUGH:
+            points = box.T_world_box.apply(opaque)
+            travel = (parts.motions[k].apply(points) - points).norm(dim=-1)
+            low, high = _span(opaque[travel >= travel.median() / 2], _MANY)
+            least, most = -box.half_extents, box.half_extents
+            low = torch.where(low < least - _PRESSING * reach, low, least)
+            high = torch.where(high > most + _PRESSING * reach, high, most)
+            parts = parts.in_box(k, _spanning(box, low, high))
     return parts
 
 
@@ -56,12 +72,24 @@ def squared_up(parts: PosedParts) -> PosedParts:
     return parts
 
 
-def _tight(parts: PosedParts, k: int) -> Box:
-    """A part's box, as large as holds all its opaque splats but a few; as it is if the part has hardly any."""
-    box, splats = parts.boxes[k], parts.part_splats(k)
-    opaque = splats.means[splats.opacities > _OPAQUE] * box.half_extents
-    if len(opaque) <= _ENOUGH:
-        return box
-    low, high = (opaque.quantile(q, 0) for q in (0.002, 0.998))
+def _opaque(parts: PosedParts, k: int) -> Float[Tensor, "P 3"]:
+    """A part's opaque splats, from its box's centre along its axes, world units."""
+    splats = parts.part_splats(k)
+    return splats.means[splats.opacities > _OPAQUE] * parts.boxes.half_extents[k]
+
+
+def _span(points: Float[Tensor, "P 3"], but: float) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
+    """From where to where points lie along each axis, but for some share of them at either end."""
+    return points.quantile(but, 0), points.quantile(1 - but, 0)
+
+
+def _spanning(box: Box, low: Float[Tensor, " 3"], high: Float[Tensor, " 3"]) -> Box:
+    """A box with another's axes that reaches from `low` to `high` of its centre, along them."""
     pose = SE3.from_quat(box.T_world_box.wxyz, box.T_world_box.apply((high + low) / 2))
     return Box(pose, ((high - low) / 2).clamp(min=1e-6))
+
+
+def _tight(parts: PosedParts, k: int) -> Box:
+    """A part's box, as large as holds all its opaque splats but a few; as it is if the part has hardly any."""
+    box, opaque = parts.boxes[k], _opaque(parts, k)
+    return _spanning(box, *_span(opaque, _STRAY)) if len(opaque) > _ENOUGH else box

@@ -183,12 +183,13 @@ class Fitter:
 
     @torch.no_grad()
     def _square_up(self) -> None:
-        """Turns boxes along the faces of their parts: joints are drawn to the axes of the base's, which is also made tight.
+        """Turns boxes along the faces of their parts, as joints are drawn to the axes of the base's.
 
-        What moves has its boxes drawn out instead, to where its splats have grown.
+        The base's is also made tight, and those of what moves are drawn out where splats press on.
         """
-        leaves = self.state.variables.leaves
-        for name, value in Variables.of(drawn_out(base_tightened(squared_up(self.state.variables.parts())))).leaves.items():
+        leaves, reach = self.state.variables.leaves, self.config.growth.reach * self.state.size
+        parts = drawn_out(base_tightened(squared_up(self.state.variables.parts())), reach)
+        for name, value in Variables.of(parts).leaves.items():
             if name != "motions":
                 leaves[name].copy_(value)
 

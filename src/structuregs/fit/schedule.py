@@ -112,7 +112,7 @@ class FitConfig:
     along_base: float = 1.0
     """Of the squared sine of the angle between a joint's axis and the nearest one of the base's box, where that is small."""
     square_at: tuple[float, ...] = (0.35, 0.6)
-    """Parts of the fit after which boxes are turned along the faces of their parts and drawn out to where splats have grown."""
+    """Parts of the fit after which boxes are turned along the faces of their parts, and drawn out where splats press on."""
     join_at: float = 0.35
     """Part of the fit after which parts that touch and move alike are made one, and what need not move is left to the base;
     1 for never."""
