@@ -6,6 +6,7 @@ grain, says better how it lies in its plane; how far before that plane, and how 
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,13 +32,14 @@ _BEFORE, _UNDER = 2.5, 1.5  # units: what lies farther from the other state's su
 _BLURS = (1.6, 0.8)  # pixels
 _CUT_OFF = 0.15  # differences of brightness count as at most this
 _PLAIN = 0.002  # what varies by less than half a grey level says nothing
-_REACH = 3  # units to either side in which a face is looked for,...
+_REACH = 7  # units to either side in which a face is looked for,...
 _FINER = 2  # ...and so many about what was found in each finer look
+_GLANCE, _MOST = 8_000, 30_000  # pixels that do for that, and for the finer looks
+_TOGETHER = 1.0  # units: the places that either half of the photos finds lie no farther apart
+_BETTER = 0.98  # where one half of the photos is most alike leaves no more than this share of what was unexplained of the other
 _TURNED = 0.95  # a face turns in its plane where that leaves less than this share of what is left without
 _FEWEST = 100  # pixels of each half of the photos that say something
-_TELLING = 0.5  # of the way to it: both halves of the photos have to find the same place, within reach,...
-_ALIKE = 0.8  # ...no more than this share of what varies may then be left unexplained,...
-_BETTER = 0.95  # ...and less than this share of what was
+_ALIKE = 0.8  # no more than this share of what varies may be left unexplained in the end
 
 
 class Shown:
@@ -240,37 +242,63 @@ class Face:
         return self.overlap.unlike(self.moved(place), blur)
 
     def place(self) -> Float64[np.ndarray, " 3"]:
-        """Where the photos are most alike; turned only where that makes them clearly more so."""
+        """Where the photos are most alike, not turned."""
         steps = np.arange(-_REACH, _REACH + 1.0)
         tried = [np.array([x, y, 0.0]) for x in steps for y in steps]
-        place = min(tried, key=lambda at: self.unlike(at, _BLURS[0]))
-        for blur in _BLURS:
-            place = self._nearby(place, blur, np.array([_FINER, _FINER, 0.0]))
-        turned = self._nearby(place, _BLURS[-1], np.full(3, float(_FINER)))
-        return turned if self.unlike(turned) < _TURNED * self.unlike(place) else place
+        glance = self._thinned(_GLANCE)
+        return self.nearby(min(tried, key=lambda at: glance.unlike(at, _BLURS[0])))
 
-    def _nearby(
+    def nearby(self, place: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+        """Where near a place the photos are most alike, turned as they are there."""
+        for blur in _BLURS:
+            place = self._best(place, blur, np.array([_FINER, _FINER, 0.0]))
+        return place
+
+    def turned(self, place: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+        """The same where the face may turn, too."""
+        return self._best(place, _BLURS[-1], np.full(3, float(_FINER)))
+
+    def _best(
         self, place: Float64[np.ndarray, " 3"], blur: float, reach: Float64[np.ndarray, " 3"]
     ) -> Float64[np.ndarray, " 3"]:
-        """Where the photos are most alike near a place."""
         bounds = list(zip(place - reach, place + reach, strict=True))
         options = {"maxfev": 200, "xtol": 3e-3, "ftol": 1e-4}
-        return minimize(self.unlike, place, args=(blur,), method="Powell", bounds=bounds, options=options).x
+        return minimize(self._thinned(_MOST).unlike, place, args=(blur,), method="Powell", bounds=bounds, options=options).x
+
+    def _thinned(self, most: int) -> "Face":
+        """The face as not many more than so many of its pixels show it."""
+        every = max(len(self.overlap) // most, 1)
+        return self if every == 1 else replace(self, overlap=self.overlap.of(np.arange(len(self.overlap)) % every == 0))
 
     def laid_alike(self) -> SE3 | None:
         """The motion of the part with the face where its photos are alike.
 
-        None where it says no better: a face may tell nothing, or light make it look another way.
+        None where it says no better: a face may tell nothing, or light make it look another way.  Either half of the photos has
+        to find the place, and what the one half finds has to make the other more alike.
         """
         halves = [Face(self.overlap.of(self.overlap.pixels[:, 0] % 2 == odd), self.pose) for odd in (0, 1)]
         if min(len(half.overlap) for half in halves) < _FEWEST:
             return None
-        one, other = (half.place() for half in halves)
-        place = self.place()
-        away = np.abs(place).max() > _REACH or np.linalg.norm(one - other) > _TELLING * np.linalg.norm(place)
-        if away or self.unlike(place) > min(_ALIKE, _BETTER * self.unlike(np.zeros(3))):
+        flat = [half.place() for half in halves]
+        if np.linalg.norm(flat[0] - flat[1]) > _TOGETHER:
+            return None
+        turned = [half.turned(place) for half, place in zip(halves, flat, strict=True)]
+        left, left_turned = (_left_of_each_other(halves, places) for places in (flat, turned))
+        place = self.nearby((flat[0] + flat[1]) / 2)
+        if left_turned < _TURNED * left:
+            left, place = left_turned, self.turned(place)
+        if left > _BETTER or self.unlike(place) > _ALIKE:
             return None
         return self.moved(place) @ self.overlap.motion
+
+
+def _left_of_each_other(halves: Sequence[Face], places: Sequence[Float64[np.ndarray, " 3"]]) -> float:
+    """What the place that either half of the photos finds leaves unexplained of the other half.
+
+    As a share of what is left where the face was found, the worse of the two: 1 and more if they say nothing of each other.
+    """
+    pairs = ((halves[0], places[1]), (halves[1], places[0]))
+    return max(half.unlike(place) / max(half.unlike(np.zeros(3)), 1e-12) for half, place in pairs)
 
 
 def _directions(here: Shown, there: Shown, motion: SE3, box: Box) -> tuple[np.ndarray, np.ndarray]:
