@@ -624,6 +624,19 @@ class TestReview:
             assert kept is right
         assert review.without_doubles([right]) == [right]
 
+    def test_a_part_is_taken_from_the_state_that_shows_it_thinner_and_as_clearly(self):
+        review, right, _ = self.found()
+        box = review.pieces.box(right.points)
+        thinnest = int(box.half_extents.argmin())
+        aside = 3 * (box.half_extents[thinnest] * box.T_world_box.rotation[:, thinnest]).numpy()
+        thick = replace(right, pieces=(np.concatenate([right.points, right.points + aside]),))
+        taken = review.at_its_clearest(thick)
+        assert taken.state == 1 - right.state
+        same = right.hypothesis.motion.inverse().as_matrix()
+        torch.testing.assert_close(taken.hypothesis.motion.as_matrix(), same, atol=1e-12, rtol=0)
+        clearer = replace(thick, weight=2 * taken.weight)
+        assert review.at_its_clearest(clearer) is clearer
+
     def test_a_part_takes_what_moves_along_from_one_that_moves_wrongly(self):
         review, right, wrong = self.found()
         points = right.points

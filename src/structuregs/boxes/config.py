@@ -32,7 +32,9 @@ class SearchConfig:
     hopeless: float = 0.3
     """Another way for a part to lie is not pulled into place if it costs this share of the part's weight more."""
     thinner: float = 0.7
-    """A part is shown by the other state's splats if its box has less than this share of the volume there."""
+    """A part is shown by the other state's splats if its box has less than this share of the volume there..."""
+    as_clear: float = 0.7
+    """...and if it has at least this share of its weight there: what is shut shows its front only."""
     together: int = 3
     """A part may show as several clusters of a state: the boxes of so many with any one are laid upon the other state's."""
     there: float = 0.12

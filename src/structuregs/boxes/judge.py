@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..geometry import SE3, Box, Screw, screw_at
 from ..joints import kind_of
-from ..model import SH_C0, Splats
-from ..raster import Render, coverage_of, image_loss, render
+from ..model import Splats
+from ..raster import Backdrop, Render, image_loss, render
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
@@ -43,12 +43,28 @@ class Scene:
     views: Int64[np.ndarray, " L"]
     still: KDTree
 
+    @cached_property
+    def _seen(self) -> dict[int, tuple[Backdrop, Float[Tensor, "H W"]]]:
+        """Of the photos that were asked for: the rest as it stands in them, and their errors without the part."""
+        return {}
+
+    def _without(self, v: int) -> tuple[Backdrop, Float[Tensor, "H W"]]:
+        """The rest as it stands in a photo, and the photo's errors without the part."""
+        if v not in self._seen:
+            camera, target = self.look.stack.cameras[v], self.look.stack.target(v)
+            with torch.no_grad():
+                self._seen[v] = Backdrop(self.rest, camera), _errors(render(self.rest, camera), *target)
+        return self._seen[v]
+
     def loss(self, part: Splats, v: int) -> Float[Tensor, ""]:
         """Error of one photo with the part where it is."""
-        stack = self.look.stack
-        rgb, alpha = stack.target(v)
-        picture = render(Splats.concatenate([self.rest, part]), stack.cameras[v])
-        return image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=_ALPHA_WEIGHT)
+        backdrop, without = self._without(v)
+        patch = backdrop.with_others(part)
+        picture = patch.drawn(part.means.new_ones(3))
+        rgb, alpha = (image[patch.rows, patch.columns] for image in self.look.stack.target(v))
+        error = image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=_ALPHA_WEIGHT)
+        elsewhere = without.sum() - without[patch.rows, patch.columns].sum()
+        return (error * alpha.numel() + elsewhere) / without.numel()
 
     @torch.no_grad()
     def error(self, part: Splats, motion: SE3, quick: bool = False) -> float:
@@ -57,26 +73,24 @@ class Scene:
         views = self.views[:_FEW] if quick else self.views
         return float(np.mean([float(self.loss(moved, int(v))) for v in views]))
 
-    @cached_property
+    def without(self, quick: bool = False) -> float:
+        """Mean error of the judging photos without the part; of the few of a quick look."""
+        return float(np.mean([float(self._without(int(v))[1].mean()) for v in (self.views[:_FEW] if quick else self.views)]))
+
+    @property
     def absent(self) -> float:
         """Mean error of the judging photos without the part."""
-        return self.error(self.rest[:0], SE3.identity(dtype=torch.float64))
-
-    @cached_property
-    def absent_quick(self) -> float:
-        """The same of the few photos of a quick look."""
-        return self.error(self.rest[:0], SE3.identity(dtype=torch.float64), quick=True)
-
-    def without(self, quick: bool = False) -> float:
-        """`absent`, or `absent_quick`."""
-        return self.absent_quick if quick else self.absent
+        return self.without()
 
     @torch.no_grad()
     def footprint(self, part: Splats) -> float:
         """Mean share of the judging photos that the part paints where it is."""
-        both = Splats.concatenate([self.rest, part])
-        chosen = torch.arange(len(both)) >= len(self.rest)
-        return float(np.mean([float(coverage_of(both, chosen, self.look.stack.cameras[v]).mean()) for v in self.views]))
+        painted = 0.0
+        for v in self.views.tolist():
+            patch = self._without(v)[0].with_others(part)
+            own = (torch.arange(len(patch.projection.rgb)) >= patch.count).float()
+            painted += float(patch.drawn(part.means.new_zeros(3), own[:, None].repeat(1, 3)).rgb[..., 0].sum())
+        return painted / self.pixels
 
     @property
     def pixels(self) -> int:
@@ -91,16 +105,17 @@ class Scene:
         """
         rows = np.zeros((len(motions.wxyz_xyz), len(part)))
         for v in self.views.tolist():
-            camera, target = self.look.stack.cameras[v], self.look.stack.target(v)
-            with torch.no_grad():
-                without = _errors(render(self.rest, camera), *target)
+            backdrop, without = self._without(v)
+            target = self.look.stack.target(v)
             for m, row in enumerate(rows):
-                both = Splats.concatenate([self.rest, part.moved(motions[m])])
-                sh = both.sh.requires_grad_()
-                picture = render(replace(both, sh=sh), camera)
-                fall = (without - _errors(picture, *target)).detach()
-                painted = torch.autograd.grad(picture.rgb, sh, fall[..., None].expand_as(picture.rgb) / 3)[0]
-                row += painted[len(self.rest) :, 0].sum(-1).double().numpy() / SH_C0
+                with torch.no_grad():
+                    patch = backdrop.with_others(part.moved(motions[m]))
+                rgb = patch.projection.rgb.requires_grad_()
+                picture = patch.drawn(part.means.new_ones(3), rgb)
+                errors = _errors(picture, *(image[patch.rows, patch.columns] for image in target))
+                fall = (without[patch.rows, patch.columns] - errors).detach()
+                painted = torch.autograd.grad(picture.rgb, rgb, fall[..., None].expand_as(picture.rgb) / 3)[0]
+                row += painted[patch.count :].sum(-1).double().numpy()
         return rows
 
 

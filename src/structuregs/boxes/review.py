@@ -28,7 +28,7 @@ class PartReview:
     def reviewed(self, found: list[MovingPart]) -> list[MovingPart]:
         """The parts as all of them together say."""
         parts = self.exchanged(self.without_doubles(found))
-        parts = self._reconsider([self._at_its_clearest(part) for part in parts])
+        parts = self._reconsider([self.at_its_clearest(part) for part in parts])
         return [self._laid_alike(part) for part in self._settled(self._without_pieces(parts))]
 
     def without_doubles(self, parts: list[MovingPart]) -> list[MovingPart]:
@@ -85,10 +85,11 @@ class PartReview:
             replace(giver, pieces=tuple(left), weight=max(giver.weight - weight, 0.0)),
         )
 
-    def _at_its_clearest(self, part: MovingPart) -> MovingPart:
-        """The part as the other state shows it, if it is as large there but thinner.
+    def at_its_clearest(self, part: MovingPart) -> MovingPart:
+        """The part as the other state shows it, if it is as large there but thinner, and photos show it there about as well.
 
-        Where few views look along a panel, the hull carries more than the panel, and what is fitted to it lies askew.
+        Where few views look along a panel, the hull carries more than the panel, and what is fitted to it lies askew.  What is
+        thinner because it is shut shows its front only: turned the wrong way round, it may look like the back.
         """
         pieces, other = self.pieces, 1 - part.state
         there = [i for i in sorted(pieces.explained_by(part)) if pieces.clusters[i].state == other]
@@ -99,8 +100,10 @@ class PartReview:
         smaller = then.half_extents.sort()[0] / now.half_extents.sort()[0]
         if float(smaller.prod()) > self.config.thinner or float(smaller[1:].min()) < 0.8:
             return part
-        back = [replace(h, motion=h.motion.inverse()) for h in (part.hypothesis, *part.rivals)]
         weight = sum(pieces.weights[i] for i in there)
+        if weight < self.config.as_clear * part.weight:
+            return part
+        back = [replace(h, motion=h.motion.inverse()) for h in (part.hypothesis, *part.rivals)]
         return replace(part, state=other, pieces=points, hypothesis=back[0], rivals=tuple(back[1:]), weight=weight)
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
