@@ -15,7 +15,7 @@ test: install $(ORACLES)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist worksteal
 
 bench: install
 	$(BIN)/python benchmarks/speed.py --against benchmarks/baseline.json
