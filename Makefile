@@ -15,6 +15,7 @@ test: install $(ORACLES)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+	$(BIN)/pytest -k any_number_of_threads tests/test_raster_cpu.py tests/test_image_loss.py  # with all threads in one process
 	$(BIN)/pytest -n auto --dist worksteal
 
 bench: install
