@@ -13,7 +13,7 @@ from torch import Tensor
 from ..geometry import SE3, Box, Screw, screw_at
 from ..joints import kind_of
 from ..model import Splats
-from ..raster import Backdrop, Render, image_loss, render
+from ..raster import Backdrop, Render, image_loss
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
@@ -51,9 +51,9 @@ class Scene:
     def _without(self, v: int) -> tuple[Backdrop, Float[Tensor, "H W"]]:
         """The rest as it stands in a photo, and the photo's errors without the part."""
         if v not in self._seen:
-            camera, target = self.look.stack.cameras[v], self.look.stack.target(v)
-            with torch.no_grad():
-                self._seen[v] = Backdrop(self.rest, camera), _errors(render(self.rest, camera), *target)
+            backdrop = Backdrop(self.rest, self.look.stack.cameras[v])
+            picture = backdrop.drawn(self.rest.means.new_ones(3))
+            self._seen[v] = backdrop, _errors(picture, *self.look.stack.target(v)).detach()
         return self._seen[v]
 
     def loss(self, part: Splats, v: int) -> Float[Tensor, ""]:
@@ -61,9 +61,9 @@ class Scene:
         backdrop, without = self._without(v)
         patch = backdrop.with_others(part)
         picture = patch.drawn(part.means.new_ones(3))
-        rgb, alpha = (image[patch.rows, patch.columns] for image in self.look.stack.target(v))
+        rgb, alpha = map(patch.cut, self.look.stack.target(v))
         error = image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=_ALPHA_WEIGHT)
-        elsewhere = without.sum() - without[patch.rows, patch.columns].sum()
+        elsewhere = without.sum() - patch.cut(without).sum()
         return (error * alpha.numel() + elsewhere) / without.numel()
 
     @torch.no_grad()
@@ -73,14 +73,22 @@ class Scene:
         views = self.views[:_FEW] if quick else self.views
         return float(np.mean([float(self.loss(moved, int(v))) for v in views]))
 
-    def without(self, quick: bool = False) -> float:
-        """Mean error of the judging photos without the part; of the few of a quick look."""
-        return float(np.mean([float(self._without(int(v))[1].mean()) for v in (self.views[:_FEW] if quick else self.views)]))
-
-    @property
+    @cached_property
     def absent(self) -> float:
         """Mean error of the judging photos without the part."""
-        return self.without()
+        return self._mean_without(self.views)
+
+    @cached_property
+    def absent_quick(self) -> float:
+        """The same of the few photos of a quick look."""
+        return self._mean_without(self.views[:_FEW])
+
+    def _mean_without(self, views: Int64[np.ndarray, " L"]) -> float:
+        return float(np.mean([float(self._without(v)[1].mean()) for v in views.tolist()]))
+
+    def without(self, quick: bool = False) -> float:
+        """`absent`, or `absent_quick`."""
+        return self.absent_quick if quick else self.absent
 
     @torch.no_grad()
     def footprint(self, part: Splats) -> float:
@@ -112,8 +120,7 @@ class Scene:
                     patch = backdrop.with_others(part.moved(motions[m]))
                 rgb = patch.projection.rgb.requires_grad_()
                 picture = patch.drawn(part.means.new_ones(3), rgb)
-                errors = _errors(picture, *(image[patch.rows, patch.columns] for image in target))
-                fall = (without[patch.rows, patch.columns] - errors).detach()
+                fall = (patch.cut(without) - _errors(picture, *map(patch.cut, target))).detach()
                 painted = torch.autograd.grad(picture.rgb, rgb, fall[..., None].expand_as(picture.rgb) / 3)[0]
                 row += painted[patch.count :].sum(-1).double().numpy()
         return rows

@@ -35,6 +35,10 @@ class Patch:
         projection = self.projection if rgb is None else replace(self.projection, rgb=rgb)
         return blend(projection, self.columns.stop - self.columns.start, self.rows.stop - self.rows.start, background)
 
+    def cut(self, image: Tensor) -> Tensor:
+        """The patch of an image (H W or H W C) that shows the same."""
+        return image[self.rows, self.columns]
+
 
 class Backdrop:
     """Splats that stay as they are, as a camera sees them.
@@ -50,6 +54,10 @@ class Backdrop:
         self.camera = camera
         with torch.no_grad():
             self.projection = project(splats, camera)
+
+    def drawn(self, background: Float[Tensor, " 3"]) -> Render:
+        """The whole image, without others."""
+        return blend(self.projection, self.camera.width, self.camera.height, background)
 
     def with_others(self, splats: Splats) -> Patch:
         """Where other splats show, with what of the backdrop shows there; at least one tile of the image.
