@@ -95,6 +95,7 @@ def test_export_writes_a_folder_for_each_format(run, tmp_path, monkeypatch, caps
     written = sorted(str(file.relative_to(tmp_path / "out")) for file in (tmp_path / "out").rglob("*.*"))
     parts = [f"ply/{name}.ply" for name in ("base", "part_1", "part_2", "state_0", "state_1")]
     assert written == ["html/object.html", *parts]
+    assert f"<title>{run.name}</title>" in (tmp_path / "out" / "html" / "object.html").read_text()
     assert capsys.readouterr().out.count("wrote ") == len(written)
 
 

@@ -131,7 +131,8 @@ def export(
 
     formats = checked_formats([name.strip() for name in to.split(",") if name.strip()])
     obj, folder = load_object(run / "object"), output or run / "export"
-    done = export_files(obj, training_capture(run), folder, formats, scale=scale, limit_margin=limit_margin)
+    title = run.resolve().name
+    done = export_files(obj, training_capture(run), folder, formats, title=title, scale=scale, limit_margin=limit_margin)
     with _bars() as progress:
         steps = steps_of(formats)
         task = progress.add_task("export", total=len(steps), figures=steps[0])

@@ -78,6 +78,7 @@ def export_files(
     formats: Sequence[str],
     *,
     name: str = "object",
+    title: str = "object",
     scale: float = 1.0,
     limit_margin: float = 0.0,
 ) -> Iterator[Exported]:
@@ -88,7 +89,8 @@ def export_files(
         capture: its photos; surfaces are fused over their cameras and masks.
         folder: where the formats' folders go.
         formats: as `checked_formats` gives them.
-        name: of the robot, the stage and the page; letters, digits and underscores.
+        name: of the robot, the stage and the page's file; letters, digits and underscores.
+        title: of the page.
         scale: metres per unit of the capture, for simulators and glTF; meshes, splats and the page keep the capture's unit.
         limit_margin: by how much joints may go beyond the observed range, radians or metres.
 
@@ -121,7 +123,7 @@ def export_files(
         elif kind == "glb":
             yield Exported(kind, tuple(export_glb(obj, meshes, target, scale=scale)))
         else:
-            yield Exported(kind, (export_html(obj, target / f"{name}.html", title=name),))
+            yield Exported(kind, (export_html(obj, target / f"{name}.html", title=title),))
 
 
 def _simulated(obj: ArticulatedObject, mechanism: Mechanism, folder: Path, kind: str, name: str, scale: float) -> Path:
