@@ -118,6 +118,15 @@ def test_photos_that_show_something_else_tell_nothing(seed: int):
     assert Face.most_shown(found).laid_alike() is None
 
 
+def test_a_place_stands_out_to_every_side(monkeypatch):
+    there = np.zeros(3)
+    assert Face.most_shown(overlap(TRUE)).stands_out(there)
+    aside = Face.most_shown(overlap(beside(2, 0, 0)))
+    assert not aside.stands_out(there)
+    monkeypatch.setattr(Face, "unlike", lambda _, place: float(0.6 + 0.1 * abs(place[0]) - 0.01 * place[1]))  # a shade along y
+    assert not aside.stands_out(there)
+
+
 def test_a_face_that_is_where_it_was_found_stays():
     assert Face.most_shown(overlap(TRUE)).laid_alike() is None
 

@@ -291,7 +291,8 @@ def trial_of_screen() -> Trial:
     there, here = (
         Scene(looks[s], looks[1 - s].splats[~inside[1 - s]], np.arange(0, 16, 2), KDTree(looks[s].points)) for s in (1, 0)
     )
-    return Trial(there, here, looks[1].splats, looks[0].splats[inside[0]], screen, weight=0.1, most=0.1, near=0.0, least=0.01)
+    splats, own = looks[0].splats[inside[0]], KDTree(points_of(screen, 100))
+    return Trial(there, here, looks[1].splats, splats, screen, 0.1, most=0.1, near=0.0, own=own, taken=None, least=0.01)
 
 
 def cupboard_and_tray(pushed: float) -> Trial:
@@ -320,7 +321,8 @@ def cupboard_and_tray(pushed: float) -> Trial:
     look = looks_of("laptop")[1][0]
     still = KDTree(cupboard.means.numpy())
     there, here = (Scene(replace(look, stack=stack), cupboard, np.arange(8), still) for stack in stacks)
-    return Trial(there, here, cupboard, tray, box, weight=0.04, most=0.04, near=0.0, least=0.002)
+    own = KDTree(tray.means.numpy())
+    return Trial(there, here, cupboard, tray, box, weight=0.04, most=0.04, near=0.0, own=own, taken=None, least=0.002)
 
 
 @dataclass(frozen=True)
@@ -623,6 +625,37 @@ class TestReview:
             (kept,) = review.without_doubles(parts)
             assert kept is right
         assert review.without_doubles([right]) == [right]
+
+    def test_a_part_found_in_two_is_one_however_its_lesser_piece_moves(self):
+        review, right, wrong = self.found()
+        left = right.points[:, 0] < 0.5
+        for astray in (right, wrong):
+            large = replace(right, pieces=(right.points[left],), weight=0.9 * right.weight)
+            small = replace(astray, pieces=(right.points[~left],), weight=0.1 * right.weight)
+            for parts in ([large, small], [small, large]):
+                (whole,) = review.joined(parts)
+                assert len(whole.points) == len(right.points)
+                torch.testing.assert_close(whole.hypothesis.motion.as_matrix(), right.hypothesis.motion.as_matrix())
+
+    def test_parts_side_by_side_that_move_differently_stay_two(self):
+        review = PartReview(Pieces(looks_of("cabinet")[1], SMALL.search, seed=0))
+        parts = parts_of("cabinet")
+        assert len(parts) == 2
+        assert review.joined(parts) == parts
+        assert review.joined(parts[:1]) == parts[:1]
+
+    def test_what_lies_nearer_to_another_part_is_not_brought_back(self):
+        review, right, _ = self.found()
+        left = right.points[:, 0] < 0.0
+        one, other = (replace(right, pieces=(right.points[side],)) for side in (left, ~left))
+        whole = review.pieces.trial(right.state, right.points, review.pieces.splats_of(right), 1.0, [])
+        taken = KDTree(other.points_in(1 - right.state))
+        free = whole.brought(right.hypothesis.motion)
+        kept = replace(whole, own=KDTree(one.points), taken=taken).brought(right.hypothesis.motion)
+        back = right.hypothesis.motion.inverse().apply(kept.means.double())
+        assert 0 < len(kept) < len(free)
+        assert float(back[:, 0].max()) < 2 * review.pieces.voxel
+        assert float(right.hypothesis.motion.inverse().apply(free.means.double())[:, 0].max()) > 4 * review.pieces.voxel
 
     def test_a_part_is_taken_from_the_state_that_shows_it_thinner_and_as_clearly(self):
         review, right, _ = self.found()

@@ -6,6 +6,7 @@ grain, says better how it lies in its plane; how far before that plane, and how 
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,6 +36,7 @@ _PLAIN = 0.002  # what varies by less than half a grey level says nothing
 _REACH = 7  # units to either side in which a face is looked for,...
 _FINER = 2  # ...and so many about what was found in each finer look
 _GLANCE, _MOST = 8_000, 30_000  # pixels that do for that, and for the finer looks
+_ASIDE, _LESS = 3, 1.1  # so many units beside its place photos leave so many times as much, or it is none
 _TOGETHER = 1.0  # units: the places that either half of the photos finds lie no farther apart
 _BETTER = 0.98  # where one half of the photos is most alike leaves no more than this share of what was unexplained of the other
 _TURNED = 0.95  # a face turns in its plane where that leaves less than this share of what is left without
@@ -265,6 +267,12 @@ class Face:
         options = {"maxfev": 200, "xtol": 3e-3, "ftol": 1e-4}
         return minimize(self._thinned(_MOST).unlike, place, args=(blur,), method="Powell", bounds=bounds, options=options).x
 
+    def stands_out(self, place: Float64[np.ndarray, " 3"]) -> bool:
+        """Whether photos are clearly less alike to all sides of a place.  Light that falls off along a face leads astray."""
+        face = self._thinned(_MOST)
+        around = [place + _ASIDE * np.array([x, y, 0]) / math.hypot(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
+        return min(map(face.unlike, around)) > _LESS * face.unlike(place)
+
     def _thinned(self, most: int) -> "Face":
         """The face as not many more than so many of its pixels show it."""
         every = max(len(self.overlap) // most, 1)
@@ -274,7 +282,7 @@ class Face:
         """The motion of the part with the face where its photos are alike.
 
         None where it says no better: a face may tell nothing, or light make it look another way.  Either half of the photos has
-        to find the place, and what the one half finds has to make the other more alike.
+        to find the place, what the one half finds has to make the other more alike, and around it photos have to be less alike.
         """
         halves = [Face(self.overlap.of(self.overlap.pixels[:, 0] % 2 == odd), self.pose) for odd in (0, 1)]
         if min(len(half.overlap) for half in halves) < _FEWEST:
@@ -287,7 +295,7 @@ class Face:
         place = self.nearby((flat[0] + flat[1]) / 2)
         if left_turned < _TURNED * left:
             left, place = left_turned, self.turned(place)
-        if left > _BETTER or self.unlike(place) > _ALIKE:
+        if left > _BETTER or self.unlike(place) > _ALIKE or not self.stands_out(place):
             return None
         return self.moved(place) @ self.overlap.motion
 

@@ -59,7 +59,8 @@ class SearchConfig:
     same: float = 0.15
     """Two parts may be one if their motions are this close, over the half diagonal of the one..."""
     alike: float = 0.12
-    """...and if moving it just like the other costs the photos less than this fraction of the part's weight."""
+    """...and if moving it just like the other, or both as one, costs the photos less than this fraction of the part's weight,
+    the lesser's."""
     crumbs: float = 0.3
     """Of a part that is left with less than this share of its points, when one beside it has taken what moves along, nothing
     stays."""

@@ -1,5 +1,6 @@
 """The photos as judges of motion hypotheses."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -147,6 +148,8 @@ class Trial:
         weight: what the photos of the part's own state would lose without it, in mean error.
         most: what it can explain of either: its weight, with that of what moves along.
         near: how far from the moved box splats count as lying there, world units.
+        own: points of the part, in its own state.
+        taken: points of the other parts as they stand in the other state; None where they are not asked.
         least: a part shows in the other state if it takes this much off the error of its photos.
     """
 
@@ -158,6 +161,8 @@ class Trial:
     weight: float
     most: float
     near: float
+    own: KDTree
+    taken: KDTree | None
     least: float
 
     @property
@@ -166,8 +171,13 @@ class Trial:
         return self.there.absent + self.here.absent
 
     def brought(self, motion: SE3) -> Splats:
-        """What lies in the other state where a motion takes the part; still there."""
-        return self.others[self.box.moved(motion).contains(self.others.means.double(), margin=self.near)]
+        """What lies in the other state where a motion takes the part, and no nearer to another part; still there."""
+        lying = self.others[self.box.moved(motion).contains(self.others.means.double(), margin=self.near)]
+        if self.taken is None or not len(lying):
+            return lying
+        means = lying.means.double()
+        from_own = self.own.query(motion.inverse().apply(means).numpy())[0]
+        return lying[torch.from_numpy(from_own < self.taken.query(means.numpy())[0] + 0.5 * self.near)]
 
     @cached_property
     def in_sight(self) -> float:
@@ -182,6 +192,22 @@ class Trial:
         asked = not quick and kind_of(motion) == "revolute"
         seen = self.there.footprint(self.piece.moved(motion)) / max(self.in_sight, 1e-12) if asked else 1.0
         return replace(hypothesis, image_error=there, back_error=here, seen=seen)
+
+    def apart(self, pieces: Iterable[tuple[Splats, Box, SE3]]) -> float:
+        """Error of the photos of both states with pieces of the part each moved its own way.
+
+        Args:
+            pieces: splats and box of each in its own state, and its motion; what lies where two go belongs to the first.
+        """
+        rest = SE3.identity(dtype=torch.float64)
+        free = torch.ones(len(self.others), dtype=torch.bool)
+        gone, come = [], []
+        for splats, box, motion in pieces:
+            lying = free & box.moved(motion).contains(self.others.means.double(), margin=self.near)
+            free &= ~lying
+            gone.append(splats.moved(motion))
+            come.append(self.others[lying].moved(motion.inverse()))
+        return self.there.error(Splats.concatenate(gone), rest) + self.here.error(Splats.concatenate(come), rest)
 
     def moved(self, hypothesis: Hypothesis, motion: SE3) -> Hypothesis:
         """The hypothesis with another motion; what masks and photos say is still that of the old one."""

@@ -173,6 +173,8 @@ class Pieces:
             weight=weight,
             most=weight,
             near=self.voxel,
+            own=KDTree(points),
+            taken=None,
             least=self.config.shows * weight,
         )
 

@@ -1,5 +1,6 @@
 """Parts looked at again, with all others in place: what belongs to which, which are one or none, and how each moves."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +29,7 @@ class PartReview:
     def reviewed(self, found: list[MovingPart]) -> list[MovingPart]:
         """The parts as all of them together say."""
         parts = self.exchanged(self.without_doubles(found))
-        parts = self._reconsider([self.at_its_clearest(part) for part in parts])
+        parts = self._reconsider(self.joined([self.at_its_clearest(part) for part in parts]))
         return [self._laid_alike(part) for part in self._settled(self._without_pieces(parts))]
 
     def without_doubles(self, parts: list[MovingPart]) -> list[MovingPart]:
@@ -106,6 +107,36 @@ class PartReview:
         back = [replace(h, motion=h.motion.inverse()) for h in (part.hypothesis, *part.rivals)]
         return replace(part, state=other, pieces=points, hypothesis=back[0], rivals=tuple(back[1:]), weight=weight)
 
+    def joined(self, parts: list[MovingPart]) -> list[MovingPart]:
+        """The parts, those side by side in one state made one that as one explain the photos better, or moving alike as well.
+
+        A door and what stands before it may be found as two.  They are asked before either is pulled into place: each
+        would be pulled over what the other leaves unexplained, and what is thin hardly says how it moves.
+        """
+        parts, beside = list(parts), self.config.cue.link + self.config.clear
+        while True:
+            ways = [
+                (*self._as_one(one, two, [part for part in parts if part is not one and part is not two]), (one, two))
+                for one, two in itertools.combinations(parts, 2)
+                if one.state == two.state and self._touch(one, two, beside)
+            ]
+            harm, whole, pair = min(ways, key=lambda way: way[0], default=(1.0, None, ()))
+            if whole is None or harm > 0:
+                return parts
+            parts = [whole, *(part for part in parts if all(part is not one for one in pair))]
+
+    def _as_one(self, one: MovingPart, two: MovingPart, rest: list[MovingPart]) -> tuple[float, MovingPart]:
+        """What speaks against two parts of one state being one, in mean error (below 0: nothing), and the two as one."""
+        follower, leader = sorted((one, two), key=lambda part: part.weight)
+        (whole,) = self._merged(leader, follower, [])
+        trial, box = self._again(whole, rest), self.pieces.box
+        ways = [trial.judge(h) for h in (leader.hypothesis, trial.moved(leader.hypothesis, follower.hypothesis.motion))]
+        best = min(ways, key=lambda h: h.error)
+        apart = trial.apart((self.pieces.splats_of(p), box(p.points), p.hypothesis.motion) for p in (leader, follower))
+        gap = displacements(stack_motions([leader.hypothesis.motion]), follower.hypothesis.motion, box(follower.points))[0]
+        allowed = self.config.alike * follower.weight if gap < self.config.same else 0.0
+        return best.error - apart - allowed, replace(whole, hypothesis=best)
+
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
         """Looks at each part again with all others in place; one that may as well move like another becomes one with it."""
         parts = list(parts)
@@ -124,8 +155,9 @@ class PartReview:
             beside = np.array([self._touch(part, other) for other in others])
             touching = np.array([self._continues(part, other) for other in others])
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
-            # What does not show in the other state says little of how it moves.
-            alike &= trial.shows(starts[0]) | touching | (beside & (gaps < self.config.same / 2))
+            # What does not show in the other state says little of how it moves, but two pieces do not agree by chance.
+            agree = gaps < self.config.same / np.where(beside, 2, 8)
+            alike &= trial.shows(starts[0]) | touching | agree
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
             best_of_its_own = min(h.error + trial.gone_in(h) + h.against(part.weight) for h in again[: -len(shared)])
             needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
@@ -150,12 +182,12 @@ class PartReview:
         whole, *both = (float(self.pieces.box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
         return sum(both) > self.config.cue.hollow * whole
 
-    def _touch(self, one: MovingPart, other: MovingPart) -> bool:
-        """Whether two parts, one of which may be empty, touch where they were found (the clustering's reach)."""
+    def _touch(self, one: MovingPart, other: MovingPart, reach: float | None = None) -> bool:
+        """Whether two parts, one of which may be empty, touch where they were found (`reach` in voxels: the clustering's)."""
         if not one.pieces or not other.pieces:
             return False
         gap = KDTree(other.points_in(one.state)).query(one.points)[0].min()
-        return bool(gap <= self.config.cue.link * self.pieces.voxel)
+        return bool(gap <= (self.config.cue.link if reach is None else reach) * self.pieces.voxel)
 
     def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those that lie within a larger one: what was left over before that one was whole."""
@@ -204,4 +236,6 @@ class PartReview:
 
     def _again(self, part: MovingPart, others: list[MovingPart]) -> Trial:
         """A part between the photos of both states, with all other parts in place."""
-        return self.pieces.trial(part.state, part.points, self.pieces.splats_of(part), part.weight, others)
+        trial = self.pieces.trial(part.state, part.points, self.pieces.splats_of(part), part.weight, others)
+        taken = [other.points_in(1 - part.state) for other in others]
+        return replace(trial, taken=KDTree(np.concatenate(taken)) if taken else None)
