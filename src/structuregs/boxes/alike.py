@@ -36,7 +36,7 @@ _PLAIN = 0.002  # what varies by less than half a grey level says nothing
 _REACH = 7  # units to either side in which a face is looked for,...
 _FINER = 2  # ...and so many about what was found in each finer look
 _GLANCE, _MOST = 8_000, 30_000  # pixels that do for that, and for the finer looks
-_ASIDE, _LESS = 3, 1.1  # so many units beside its place photos leave so many times as much, or it is none
+_ASIDE, _LESS = 3, 1.15  # so many units beside its place photos leave so many times as much, or it is none
 _TOGETHER = 1.0  # units: the places that either half of the photos finds lie no farther apart
 _BETTER = 0.98  # where one half of the photos is most alike leaves no more than this share of what was unexplained of the other
 _TURNED = 0.95  # a face turns in its plane where that leaves less than this share of what is left without
@@ -288,7 +288,7 @@ class Face:
         if min(len(half.overlap) for half in halves) < _FEWEST:
             return None
         flat = [half.place() for half in halves]
-        if np.linalg.norm(flat[0] - flat[1]) > _TOGETHER:
+        if np.linalg.norm(flat[0] - flat[1]) > _TOGETHER or np.abs(flat).max() > _REACH - 0.5:  # may be likelier still beyond
             return None
         turned = [half.turned(place) for half, place in zip(halves, flat, strict=True)]
         left, left_turned = (_left_of_each_other(halves, places) for places in (flat, turned))
