@@ -6,7 +6,6 @@ grain, says better how it lies in its plane; how far before that plane, and how 
 """
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -270,7 +269,7 @@ class Face:
     def stands_out(self, place: Float64[np.ndarray, " 3"]) -> bool:
         """Whether photos are clearly less alike to all sides of a place.  Light that falls off along a face leads astray."""
         face = self._thinned(_MOST)
-        around = [place + _ASIDE * np.array([x, y, 0]) / math.hypot(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
+        around = [place + _ASIDE * np.array([np.cos(a), np.sin(a), 0]) for a in np.arange(8) * np.pi / 4]
         return min(map(face.unlike, around)) > _LESS * face.unlike(place)
 
     def _thinned(self, most: int) -> "Face":

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from scipy.optimize import minimize_scalar
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -170,9 +170,13 @@ class Trial:
         """Error of the photos of both states without the part."""
         return self.there.absent + self.here.absent
 
+    def _lying_in(self, box: Box) -> Bool[Tensor, " N"]:
+        """Which splats of the other state lie in a box there."""
+        return box.contains(self.others.means.double(), margin=self.near)
+
     def brought(self, motion: SE3) -> Splats:
         """What lies in the other state where a motion takes the part, and no nearer to another part; still there."""
-        lying = self.others[self.box.moved(motion).contains(self.others.means.double(), margin=self.near)]
+        lying = self.others[self._lying_in(self.box.moved(motion))]
         if self.taken is None or not len(lying):
             return lying
         means = lying.means.double()
@@ -203,7 +207,7 @@ class Trial:
         free = torch.ones(len(self.others), dtype=torch.bool)
         gone, come = [], []
         for splats, box, motion in pieces:
-            lying = free & box.moved(motion).contains(self.others.means.double(), margin=self.near)
+            lying = free & self._lying_in(box.moved(motion))
             free &= ~lying
             gone.append(splats.moved(motion))
             come.append(self.others[lying].moved(motion.inverse()))

@@ -118,7 +118,7 @@ class PartReview:
             ways = [
                 (*self._as_one(one, two, [part for part in parts if part is not one and part is not two]), (one, two))
                 for one, two in itertools.combinations(parts, 2)
-                if one.state == two.state and self._touch(one, two, beside)
+                if one.state == two.state and self._voxels_between(one, two) <= beside
             ]
             harm, whole, pair = min(ways, key=lambda way: way[0], default=(1.0, None, ()))
             if whole is None or harm > 0:
@@ -182,12 +182,15 @@ class PartReview:
         whole, *both = (float(self.pieces.box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
         return sum(both) > self.config.cue.hollow * whole
 
-    def _touch(self, one: MovingPart, other: MovingPart, reach: float | None = None) -> bool:
-        """Whether two parts, one of which may be empty, touch where they were found (`reach` in voxels: the clustering's)."""
+    def _touch(self, one: MovingPart, other: MovingPart) -> bool:
+        """Whether two parts touch where the one was found (the clustering's reach)."""
+        return self._voxels_between(one, other) <= self.config.cue.link
+
+    def _voxels_between(self, one: MovingPart, other: MovingPart) -> float:
+        """The least distance of their points where the one was found, in voxels; infinite if either is empty."""
         if not one.pieces or not other.pieces:
-            return False
-        gap = KDTree(other.points_in(one.state)).query(one.points)[0].min()
-        return bool(gap <= (self.config.cue.link if reach is None else reach) * self.pieces.voxel)
+            return float("inf")
+        return float(KDTree(other.points_in(one.state)).query(one.points)[0].min()) / self.pieces.voxel
 
     def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those that lie within a larger one: what was left over before that one was whole."""
