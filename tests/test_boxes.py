@@ -37,7 +37,7 @@ from structuregs.boxes.hypotheses import (
     stack_motions,
     turn_about,
 )
-from structuregs.boxes.judge import Scene, Trial, refine, shortest, simplest
+from structuregs.boxes.judge import Scene, Trial, just_out_of_sight, refine, simplest
 from structuregs.boxes.partition import Division, Found, undivided
 from structuregs.boxes.pieces import Pieces
 from structuregs.boxes.review import PartReview
@@ -533,11 +533,12 @@ class TestParts:
     @pytest.mark.parametrize(
         ("pushed", "told"), [pytest.param(0.0, 0.62, id="hidden"), pytest.param(0.4, 0.4, id="seen to stop half way")]
     )
-    def test_a_slide_out_of_sight_goes_no_farther_than_it_has_to(self, pushed: float, told: float):
+    def test_a_slide_out_of_sight_goes_straight_in_and_no_farther_than_it_has_to(self, pushed: float, told: float):
         trial = cupboard_and_tray(pushed)
-        slide = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([-told, 0, 0], dtype=F64))
+        aside = 0.0 if pushed else 0.15
+        slide = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([-told, aside, 0], dtype=F64))
         start = trial.judge(Hypothesis(slide, 0.0, 0.0, 0.0))
-        found = shortest(start, trial)
+        found = just_out_of_sight(start, trial, Box(NO_MOTION, torch.tensor([0.4, 0.4, 0.4], dtype=F64)))
         if pushed:
             assert found is start
         else:  # the tray's front is .5 before the front of the cupboard

@@ -10,7 +10,7 @@ import torch
 from structuregs.capture import Capture, View, stack_views
 from structuregs.fit.evidence import covered_in_both, seen_in_both, shown
 from structuregs.geometry import SE3, Box, Camera
-from structuregs.joints import articulate
+from structuregs.joints import REVIEW_BELOW, articulate
 from structuregs.model import ArticulatedObject, PosedParts, Splats
 from structuregs.raster import coverage_of, painted, render
 from structuregs.synthetic import RenderOptions, make_capture, make_object
@@ -67,6 +67,28 @@ def test_what_both_states_show_keeps_its_confidence(capture: Capture):
     (joint,) = seen_in_both(seen, capture).joints
     assert joint.confidence == 1
     assert joint.review == ""
+
+
+@pytest.mark.parametrize(("turned", "doubtful"), [pytest.param(90.0, True, id="turns"), pytest.param(0.0, False, id="slides")])
+def test_a_part_that_turns_has_to_be_seen_more_than_one_that_slides(capture: Capture, turned: float, doubtful: bool):
+    """In state 0 a quarter of a rod stands out of a closed box; in state 1 it lies before the box, across or as it was."""
+    box, x = hidden_ball(out=0.7), torch.linspace(-0.6, 0.6, 400)
+    shell = box.parts.splats[torch.arange(len(box.parts.splats)) < box.parts.counts[0]]
+    rod = blobs(torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], 1), 0.03)
+    half = torch.tensor([[1.1, 1.1, 1.1], [0.65, 0.05, 0.05]])
+    within = SE3.exp(torch.tensor([0.7, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    angle = torch.tensor(turned).deg2rad()
+    place = [1.3, 0.0, 0.0] if turned else [0.3, -1.3, 0.0]
+    out = SE3.exp(torch.tensor([*place, 0, 0, 0])) @ SE3.exp(torch.stack([*torch.zeros(5), angle]))
+    boxes = Box(SE3(torch.stack([SE3.identity().wxyz_xyz, within.wxyz_xyz])), half)
+    motions = SE3(torch.stack([SE3.identity().wxyz_xyz, (out @ within.inverse()).wxyz_xyz]))
+    counts = (len(shell), len(rod))
+    parts = PosedParts(boxes, motions, Splats.concatenate([shell, rod]), counts, torch.zeros(sum(counts), 3))
+    before = articulate(parts)
+    (joint,) = seen_in_both(before, capture).joints
+    assert before.joints[0].kind == ("revolute" if turned else "prismatic")
+    assert not before.joints[0].review
+    assert (joint.confidence < REVIEW_BELOW) == bool(joint.review) == doubtful
 
 
 def test_an_older_doubt_is_kept(capture: Capture):

@@ -24,7 +24,8 @@ _HIDDEN = 0.3  # of a part's weight speaks against a turn that hides the part, .
 _SEEN_SHUT = 0.2  # ...none against one after which so much is seen of it, against its own state; shut doors show more
 _GONE = 0.1  # a slide after which less than this share of a part is seen takes it out of sight, ...
 _PEEPS = 0.01  # ...if it costs and helps the other state's photos no more than this share of the part's weight
-_SLIDES = 32  # lengths that are tried
+_FARTHER = 1.5  # times what was found are tried where that has not taken it all out of sight, ...
+_SLIDES = 48  # ...in so many steps
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
 
@@ -333,23 +334,29 @@ def measured(hypothesis: Hypothesis, trial: Trial) -> Hypothesis:
     return min(hypothesis, trial.judge(replace(hypothesis, motion=screw.motion(q))), key=lambda h: h.error)
 
 
-def shortest(hypothesis: Hypothesis, trial: Trial) -> Hypothesis:
-    """The hypothesis; a slide that takes the part out of sight goes no farther than it has to.
+def just_out_of_sight(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypothesis:
+    """The hypothesis; a slide that takes the part out of sight goes straight in, and no farther than it has to.
 
     A tray that was pushed in behind a door could be anywhere there, for all that photos say.  Cupboards are built so that what
-    slides in ends just behind what hides it.
+    slides in goes along them and ends just behind what hides it.  Photos may have left part of it to be seen, as what lies
+    there, brought back, pulls elsewhere.  Where no way along an axis of the base hides the part, its own is asked.
 
     Args:
         hypothesis: a judged motion.
         trial: the part between the photos.
+        base: the base's box.
     """
-    there, margin = trial.there, _PEEPS * trial.weight
+    there, margin, centre = trial.there, _PEEPS * trial.weight, trial.box.T_world_box.xyz
     if kind_of(hypothesis.motion) != "prismatic" or hypothesis.image_error < there.absent - margin:
         return hypothesis
-    screw, q = screw_at(hypothesis.motion, "prismatic", trial.box.T_world_box.xyz)
-    for n in range(1, _SLIDES):
-        motion = screw.motion(q * n / _SLIDES)
-        hidden = there.error(trial.piece, motion) < there.absent + margin
-        if hidden and there.footprint(trial.piece.moved(motion)) < _GONE * trial.in_sight:
-            return trial.judge(trial.moved(hypothesis, motion))
+    own, q = screw_at(hypothesis.motion, "prismatic", centre)
+    axes = base.T_world_box.rotation.T
+    along = axes @ own.axis
+    nearest = int(along.abs().argmax())
+    for screw in (replace(own, axis=axes[nearest] * along[nearest].sign()), own):
+        for n in range(1, _SLIDES + 1):
+            motion = screw.motion(q * _FARTHER * n / _SLIDES)
+            hidden = there.error(trial.piece, motion) < there.absent + margin
+            if hidden and there.footprint(trial.piece.moved(motion)) < _GONE * trial.in_sight:
+                return trial.judge(trial.moved(hypothesis, motion))
     return hypothesis

@@ -15,7 +15,7 @@ from .alike import Face, Overlap, Shown
 from .cue import linked
 from .divide import AROUND, moving_along
 from .hypotheses import displacements, distinct, flips, stack_motions
-from .judge import Trial, measured, shortest
+from .judge import Trial, just_out_of_sight, measured
 from .pieces import MovingPart, Pieces
 
 
@@ -216,7 +216,8 @@ class PartReview:
             judged = [trial.judge(h) for h in ways]
             hopeful = [h for h in judged if trial.cost(h) < trial.cost(judged[0]) + self.config.hopeless * part.weight]
             again = [self.pieces.pulled(h, trial, 2 * self.config.steps) for h in hopeful]
-            parts[index] = replace(part, hypothesis=shortest(measured(min(again, key=trial.cost), trial), trial))
+            best = measured(min(again, key=trial.cost), trial)
+            parts[index] = replace(part, hypothesis=just_out_of_sight(best, trial, self.pieces.base_box))
         return parts
 
     def _laid_alike(self, part: MovingPart) -> MovingPart:

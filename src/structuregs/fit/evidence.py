@@ -19,7 +19,8 @@ from .boxes import object_size
 
 _SIZE = 128  # side of a square with as many pixels as the photos that are asked
 _PHOTOS = 16  # of either state
-_ENOUGH = 0.2  # of what a part shows in one state: as much in the other leaves nothing to wish for
+_ENOUGH = 0.2  # of what a part that slides shows in one state: as much in the other leaves nothing to wish for; ...
+_ENOUGH_TURNED = 0.35  # ...of one that turns, whose rim alone does not say about which hinge
 _TRACE = 2e-6  # of a photo: a splat that paints less in all of them is not missed
 _EMPTY = 0.5  # a pixel's coverage by the model is at least so much less than the object's where nothing shows it
 _GAPS, _HOLE = 0.005, 0.08  # of what photos show: nothing to say of so much uncovered; as much more leaves no confidence
@@ -57,9 +58,10 @@ def seen_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject:
     """The object with the confidence of its joints lowered where a part hardly shows in the photos of one state.
 
     The factor is the share of the photos that the part paints in the state where it paints less, over that in the other
-    state, times five, at most 1; where that makes a joint doubtful, a sentence asks for a look.  A part that was shut
-    shows its front (.3 to .7 where measured); one that was behind a door shows .03 and less, and where it was then is a
-    guess.
+    state, times five, or less than three where it turns, at most 1; where that makes a joint doubtful, a sentence asks for a
+    look.  A part that was shut shows its front (a door .5 and more where measured, a drawer .17); one that was behind a door
+    shows .03 and less, and where it was then is a guess; a seat under its lid shows a rim of .16 to .23, which tells its
+    turn and its hinge only together.
 
     Args:
         obj: as fitted.
@@ -77,7 +79,8 @@ def seen_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject:
 
 def _weighed(joint: Joint, shares: list[float]) -> Joint:
     """The joint after a look at the share of either state's photos that its part paints."""
-    score = min(min(shares) / max(*shares, 1e-12) / _ENOUGH, 1.0)
+    enough = _ENOUGH_TURNED if joint.kind == "revolute" else _ENOUGH
+    score = min(min(shares) / max(*shares, 1e-12) / enough, 1.0)
     hidden = shares.index(min(shares))
     return _lowered(joint, score, f"Hardly a photo of state {hidden} shows the part: where it is there is a guess.")
 
