@@ -531,7 +531,12 @@ class TestParts:
             assert (x, y, z) == pytest.approx(slide.xyz.tolist() if told else (0.3 * np.cos(angle), 0, 0), abs=1e-9)
 
     @pytest.mark.parametrize(
-        ("pushed", "told"), [pytest.param(0.0, 0.62, id="hidden"), pytest.param(0.4, 0.4, id="seen to stop half way")]
+        ("pushed", "told"),
+        [
+            pytest.param(0.0, 0.62, id="hidden"),
+            pytest.param(0.0, 0.42, id="not hidden yet"),
+            pytest.param(0.4, 0.4, id="seen to stop half way"),
+        ],
     )
     def test_a_slide_out_of_sight_goes_straight_in_and_no_farther_than_it_has_to(self, pushed: float, told: float):
         trial = cupboard_and_tray(pushed)

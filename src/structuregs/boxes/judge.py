@@ -24,8 +24,9 @@ _HIDDEN = 0.3  # of a part's weight speaks against a turn that hides the part, .
 _SEEN_SHUT = 0.2  # ...none against one after which so much is seen of it, against its own state; shut doors show more
 _GONE = 0.1  # a slide after which less than this share of a part is seen takes it out of sight, ...
 _PEEPS = 0.01  # ...if it costs and helps the other state's photos no more than this share of the part's weight
-_FARTHER = 1.5  # times what was found are tried where that has not taken it all out of sight, ...
-_SLIDES = 48  # ...in so many steps
+_SLIDES = 32  # lengths up to what was found that are tried, and...
+_FARTHER = 1.5  # ...up to so many times as much, as long as it is in sight where it...
+_IN_THE_WAY = 0.05  # ...costs the other state's photos this share of its weight; fronts that are shut cost .03 and less
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
 
@@ -338,25 +339,34 @@ def just_out_of_sight(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypoth
     """The hypothesis; a slide that takes the part out of sight goes straight in, and no farther than it has to.
 
     A tray that was pushed in behind a door could be anywhere there, for all that photos say.  Cupboards are built so that what
-    slides in goes along them and ends just behind what hides it.  Photos may have left part of it to be seen, as what lies
-    there, brought back, pulls elsewhere.  Where no way along an axis of the base hides the part, its own is asked.
+    slides in goes along them and ends just behind what hides it.  Photos may have left part of it in sight, where it only
+    spoils them, as what lies there, brought back, pulls elsewhere: then it goes on.  Where no way along an axis of the base
+    hides the part, its own is asked.
 
     Args:
         hypothesis: a judged motion.
         trial: the part between the photos.
         base: the base's box.
     """
-    there, margin, centre = trial.there, _PEEPS * trial.weight, trial.box.T_world_box.xyz
-    if kind_of(hypothesis.motion) != "prismatic" or hypothesis.image_error < there.absent - margin:
+    there, weight = trial.there, trial.weight
+    if kind_of(hypothesis.motion) != "prismatic" or hypothesis.image_error < there.absent - _PEEPS * weight:
         return hypothesis
-    own, q = screw_at(hypothesis.motion, "prismatic", centre)
+    own, q = screw_at(hypothesis.motion, "prismatic", trial.box.T_world_box.xyz)
     axes = base.T_world_box.rotation.T
     along = axes @ own.axis
     nearest = int(along.abs().argmax())
-    for screw in (replace(own, axis=axes[nearest] * along[nearest].sign()), own):
-        for n in range(1, _SLIDES + 1):
-            motion = screw.motion(q * _FARTHER * n / _SLIDES)
-            hidden = there.error(trial.piece, motion) < there.absent + margin
-            if hidden and there.footprint(trial.piece.moved(motion)) < _GONE * trial.in_sight:
-                return trial.judge(trial.moved(hypothesis, motion))
-    return hypothesis
+    straight = replace(own, axis=axes[nearest] * along[nearest].sign())
+    lengths = q * np.arange(1, round(_FARTHER * _SLIDES) + 1) / _SLIDES
+
+    def first_hidden(screw: Screw, lengths: Float64[np.ndarray, " L"]) -> SE3 | None:
+        for motion in map(screw.motion, lengths.tolist()):
+            unseen = there.error(trial.piece, motion) < there.absent + _PEEPS * weight
+            if unseen and there.footprint(trial.piece.moved(motion)) < _GONE * trial.in_sight:
+                return motion
+        return None
+
+    motion = first_hidden(own, lengths[:_SLIDES])
+    if motion is None and hypothesis.image_error < there.absent + _IN_THE_WAY * weight:
+        return hypothesis
+    motion = first_hidden(straight, lengths) or motion or first_hidden(own, lengths)
+    return hypothesis if motion is None else trial.judge(trial.moved(hypothesis, motion))
