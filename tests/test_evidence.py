@@ -72,8 +72,7 @@ def test_what_both_states_show_keeps_its_confidence(capture: Capture):
 @pytest.mark.parametrize(("turned", "doubtful"), [pytest.param(90.0, True, id="turns"), pytest.param(0.0, False, id="slides")])
 def test_a_part_that_turns_has_to_be_seen_more_than_one_that_slides(capture: Capture, turned: float, doubtful: bool):
     """In state 0 a quarter of a rod stands out of a closed box; in state 1 it lies before the box, across or as it was."""
-    box, x = hidden_ball(out=0.7), torch.linspace(-0.6, 0.6, 400)
-    shell = box.parts.splats[torch.arange(len(box.parts.splats)) < box.parts.counts[0]]
+    shell, x = blobs(walls(), 0.03), torch.linspace(-0.6, 0.6, 400)
     rod = blobs(torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], 1), 0.03)
     half = torch.tensor([[1.1, 1.1, 1.1], [0.65, 0.05, 0.05]])
     within = SE3.exp(torch.tensor([0.7, 0.0, 0.0, 0.0, 0.0, 0.0]))

@@ -231,6 +231,11 @@ class Trial:
         """Whether the photos of the other state show more than the front of the part where a judged hypothesis takes it."""
         return self.there.absent - hypothesis.image_error > self.least
 
+    def out_of_sight(self, motion: SE3) -> bool:
+        """Whether the photos of the other state neither mind nor show the part where a motion takes it."""
+        unseen = self.there.error(self.piece, motion) < self.there.absent + _PEEPS * self.weight
+        return unseen and self.there.footprint(self.piece.moved(motion)) < _GONE * self.in_sight
+
     def gone_in(self, hypothesis: Hypothesis) -> float:
         """What speaks against a judged turn that takes the part out of sight, in mean error.
 
@@ -303,10 +308,8 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
     turn, angle = screw_at(motion, "revolute", centre)
     ways: list[list[tuple[Screw, float]]] = [[], [], [(slide, length)], [(turn, angle)]]
     for way, (screw, q) in zip(ways, ((slide, length), (turn, angle)), strict=False):
-        for axes in (base.T_world_box.rotation.T, box.T_world_box.rotation.T):
-            along = axes @ screw.axis
-            nearest = int(along.abs().argmax())
-            way.append((replace(screw, axis=axes[nearest]), q * float(along[nearest])))
+        for straight in (_straight(screw, base), _straight(screw, box)):
+            way.append((straight, q * float(straight.axis @ screw.axis)))
     enough = hypothesis.error + share * max(trial.absent - hypothesis.error, 0.0) + NOISE * trial.absent
     for way in ways:
         judged = [trial.judge(trial.moved(hypothesis, screw.motion(q))) for screw, q in way]
@@ -352,21 +355,21 @@ def just_out_of_sight(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypoth
     if kind_of(hypothesis.motion) != "prismatic" or hypothesis.image_error < there.absent - _PEEPS * weight:
         return hypothesis
     own, q = screw_at(hypothesis.motion, "prismatic", trial.box.T_world_box.xyz)
-    axes = base.T_world_box.rotation.T
-    along = axes @ own.axis
-    nearest = int(along.abs().argmax())
-    straight = replace(own, axis=axes[nearest] * along[nearest].sign())
-    lengths = q * np.arange(1, round(_FARTHER * _SLIDES) + 1) / _SLIDES
+    lengths = (q * np.arange(1, round(_FARTHER * _SLIDES) + 1) / _SLIDES).tolist()
 
-    def first_hidden(screw: Screw, lengths: Float64[np.ndarray, " L"]) -> SE3 | None:
-        for motion in map(screw.motion, lengths.tolist()):
-            unseen = there.error(trial.piece, motion) < there.absent + _PEEPS * weight
-            if unseen and there.footprint(trial.piece.moved(motion)) < _GONE * trial.in_sight:
-                return motion
-        return None
+    def first_hidden(screw: Screw, lengths: list[float]) -> SE3 | None:
+        return next(filter(trial.out_of_sight, map(screw.motion, lengths)), None)
 
     motion = first_hidden(own, lengths[:_SLIDES])
     if motion is None and hypothesis.image_error < there.absent + _IN_THE_WAY * weight:
         return hypothesis
-    motion = first_hidden(straight, lengths) or motion or first_hidden(own, lengths)
+    motion = first_hidden(_straight(own, base), lengths) or motion or first_hidden(own, lengths[_SLIDES:])
     return hypothesis if motion is None else trial.judge(trial.moved(hypothesis, motion))
+
+
+def _straight(screw: Screw, box: Box) -> Screw:
+    """The screw along the nearest axis of a box, the same way."""
+    axes = box.T_world_box.rotation.T
+    along = axes @ screw.axis
+    nearest = int(along.abs().argmax())
+    return replace(screw, axis=axes[nearest] * along[nearest].sign())
