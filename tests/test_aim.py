@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,18 +11,20 @@ from torch import Tensor
 
 from door_and_drawer import DOOR, DRAWER, made_of
 from structuregs.capture import Capture, View, stack_views
-from structuregs.fit.aim import beside, misaim, with_coverage
+from structuregs.fit.aim import beside, misaim, offset_gradient, with_coverage
 from structuregs.fit.events import Note
 from structuregs.fit.loop import FitState, Fitter
 from structuregs.fit.run import RunFolder
 from structuregs.fit.schedule import FitConfig, Growth, Rates
 from structuregs.geometry import SE3, Camera
-from structuregs.raster import render
+from structuregs.raster import image_loss, render
 
 OBJECT = made_of(DOOR.motion(), DRAWER.motion())
 LENS = (200.0, 190.0, 52.0, 43.0, 100, 84)
 BESIDE_DEG = 0.6
-STILL = Rates(*[0.0] * 8)  # only cameras move
+CENTRED = torch.zeros(2)
+STILL = Rates(*[0.0] * 8, principal_point=0.0)  # only turns move
+OFFSET = torch.tensor([0.004, -0.007])  # focal lengths: .8 and -1.3 pixels
 
 
 def cameras(count: int) -> list[Camera]:
@@ -39,8 +42,8 @@ def turns_of(count: int, seed: int) -> Tensor:
     return math.radians(BESIDE_DEG) * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
 
 
-def photographed_by(true: list[Camera], turns: list[Tensor]) -> Capture:
-    """Photos by the true cameras, said to be by cameras from which the turns (of either state) lead back to those."""
+def photographed_by(true: list[Camera], turns: list[Tensor], offset: Tensor = CENTRED) -> Capture:
+    """Photos by the true cameras, said to be by cameras from which turns (of either state) and the offset lead back there."""
     states = []
     for state in (0, 1):
         views = []
@@ -48,7 +51,7 @@ def photographed_by(true: list[Camera], turns: list[Tensor]) -> Capture:
             image = render(OBJECT.parts.at_state(state), camera)
             straight = (image.rgb - (1 - image.alpha[..., None])) / image.alpha[..., None].clamp(min=1e-3)
             rgba = (255 * torch.cat([straight, image.alpha[..., None]], -1).clamp(0, 1)).round().byte().numpy()
-            views.append(View(f"{k:04d}", camera.turned(-turn), rgba))
+            views.append(View(f"{k:04d}", camera.turned(-turn).shifted(-offset), rgba))
         states.append(tuple(views))
     return Capture("made", Path("made"), (states[0], states[1]), ((), ()), "memory")
 
@@ -91,10 +94,10 @@ def test_photos_lie_beside_by_the_pixels_that_the_turns_make():
     assert beside(OBJECT.parts, [stack_views(views, 1000) for views in right.train]) < 0.01
 
 
-def fitter(capture: Capture) -> Fitter:
+def fitter(capture: Capture, rates: Rates = STILL) -> Fitter:
     config = FitConfig(
         steps=60, structure_until=4, image_from=4, structure_size=24, sizes=((0.0, 100),), join_at=2.0, square_at=(),
-        one_joint_from=1.0, rates=STILL, growth=Growth(interval=1000),
+        one_joint_from=1.0, rates=rates, growth=Growth(interval=1000),
     )  # fmt: skip
     return Fitter(capture, config, FitState.start(OBJECT.parts), 0, torch.device("cpu"))
 
@@ -121,33 +124,92 @@ def test_cameras_that_are_right_stay():
     assert fit.state.turns is None
 
 
+def test_the_gradient_of_the_principal_point_is_that_of_finite_differences():
+    (camera,) = cameras(1)
+    photo = render(OBJECT.parts.at_state(0), camera.shifted(OFFSET))
+
+    def loss_at(offset: Tensor) -> tuple[Tensor, Tensor]:
+        splats = OBJECT.parts.at_state(0)
+        shifted = camera.shifted(offset)
+        picture = render(replace(splats, means=splats.means.clone().requires_grad_()), shifted)
+        picture.projection.xy.retain_grad()
+        loss = image_loss(picture.rgb, picture.alpha, photo.rgb, photo.alpha, ssim_weight=0.2, alpha_weight=0.5)
+        loss.backward()
+        return loss.detach(), offset_gradient(picture, shifted)
+
+    _, gradient = loss_at(CENTRED)
+    for axis in (0, 1):
+        step = 2e-4 * torch.eye(2)[axis]
+        slope = (loss_at(step)[0] - loss_at(-step)[0]) / 4e-4
+        torch.testing.assert_close(gradient[axis], slope, rtol=0.03, atol=1e-4)
+
+
+def test_a_picture_without_gradients_is_named():
+    (camera,) = cameras(1)
+    with pytest.raises(ValueError, match="no gradients of where splats lie"):
+        offset_gradient(render(OBJECT.parts.at_state(0), camera), camera)
+
+
+def test_the_fit_finds_the_principal_point_and_goes_on_where_it_was(tmp_path: Path):
+    capture = photographed_by(cameras(3), [torch.zeros(3, 3)] * 2, OFFSET)
+    fit = fitter(capture, replace(STILL, principal_point=1e-3))
+    fit.config = replace(fit.config, aim_at=1.0, steps=160)
+    list(fit.run(80))
+    fit.state.save(tmp_path / "last.pt")
+    other = Fitter(capture, fit.config, FitState.load(tmp_path / "last.pt"), 0, torch.device("cpu"))
+    for one in (fit, other):
+        list(one.run(160))
+    torch.testing.assert_close(fit.state.offset.detach(), OFFSET, atol=3e-4, rtol=0)
+    assert torch.equal(fit.state.offset, other.state.offset)
+
+
+def test_a_principal_point_that_is_right_stays():
+    fit = fitter(photographed_by(cameras(3), [torch.zeros(3, 3)] * 2), replace(STILL, principal_point=1e-4))
+    list(fit.run(60))
+    assert fit.state.offset.abs().max() * LENS[0] < 0.02, "pixels"
+
+
 class TestKept:
     def kept(self, root: Path) -> tuple[RunFolder, Capture, list[Tensor]]:
         turns = [turns_of(3, 0), turns_of(3, 1)]
         folder, capture = RunFolder(root), photographed_by(cameras(3), turns)
-        folder.keep_turns(turns, capture)
+        folder.keep_cameras(CENTRED, turns, capture)
         return folder, capture, turns
+
+    def test_a_principal_point_is_that_of_test_views_too(self, tmp_path: Path):
+        folder, capture = RunFolder(tmp_path), photographed_by(cameras(3), [torch.zeros(3, 3)] * 2, OFFSET)
+        capture = replace(capture, test=capture.train)
+        folder.keep_cameras(OFFSET, None, capture)
+        right = folder.put_right(capture)
+        for view, camera in zip([*right.train[0], *right.test[1]], cameras(3) * 2, strict=True):
+            assert (view.camera.cx, view.camera.cy) == pytest.approx((camera.cx, camera.cy))
+        assert folder.notes.read_text().startswith("all photos lie 0.80 pixels right of and 1.33 above what")
+        folder.notes.unlink()
+        folder.keep_cameras(OFFSET / 10, None, capture)
+        assert not folder.notes.exists()
 
     def test_a_run_gives_its_capture_back_with_the_cameras_put_right(self, tmp_path: Path):
         folder, capture, _ = self.kept(tmp_path)
-        for views in folder.turned(capture).train:
+        for views in folder.put_right(capture).train:
             for view, camera in zip(views, cameras(3), strict=True):
                 torch.testing.assert_close(
                     view.camera.T_world_camera.as_matrix(), camera.T_world_camera.as_matrix(), atol=1e-6, rtol=0
                 )
-        assert RunFolder(tmp_path / "another").turned(capture) is capture
+        assert RunFolder(tmp_path / "another").put_right(capture) is capture
 
     def test_the_notes_say_so_once(self, tmp_path: Path):
         folder, capture, turns = self.kept(tmp_path)
-        folder.keep_turns(turns, capture)
+        folder.keep_cameras(CENTRED, turns, capture)
         assert folder.notes.read_text() == "cameras pointed 0.60 degrees beside their photos (median) and were turned\n"
 
-    @pytest.mark.parametrize("damage", ["", "[]", '{"turns": [{}, {}]}', '{"turns": [{"0000": [1, 2]}, {}]}'])
+    @pytest.mark.parametrize(
+        "damage", ["", "[]", '{"principal_point": [1]}', '{"principal_point": [0, 0], "turns": [{"0000": [1, 2]}, {}]}']
+    )
     def test_a_damaged_record_is_named(self, tmp_path: Path, damage: str):
         folder, capture, _ = self.kept(tmp_path)
         folder.cameras.write_text(damage)
-        with pytest.raises(ValueError, match=r"cameras\.json: not the turns of this capture's cameras .*; fit again\.$"):
-            folder.turned(capture)
+        with pytest.raises(ValueError, match=r"cameras\.json: does not say how this capture's cameras are .*; fit again\.$"):
+            folder.put_right(capture)
 
     def test_the_record_names_every_photo(self, tmp_path: Path):
         folder, _, turns = self.kept(tmp_path)

@@ -229,6 +229,15 @@ def test_a_turned_camera_stays_where_it_is_and_looks_elsewhere():
     assert pixels.tolist() == pytest.approx([view.cx, view.cy], abs=0.02)
 
 
+def test_a_shifted_camera_shows_all_points_beside_by_as_many_focal_lengths_in_any_size():
+    view, offset = camera(), torch.tensor([0.02, -0.01])
+    points = torch.tensor([[0.2, 0.1, 2.0], [-0.4, 0.3, 5.0]])
+    for size in ((view.width, view.height), (50, 40)):
+        before = view.resized(*size)
+        moved = view.shifted(offset).resized(*size).project(points)[0] - before.project(points)[0]
+        torch.testing.assert_close(moved, (offset * torch.tensor([before.fx, before.fy])).expand(2, 2), atol=1e-4, rtol=0)
+
+
 def test_directions_are_the_rays_in_the_camera_s_frame():
     view = camera()
     _, rays = view.rays()

@@ -169,7 +169,7 @@ class TestCamerasAstray:
             return math.degrees(float(torch.tensor([float((a @ b).clamp(max=1).acos()) for a, b in sights]).median()))
 
         assert beside_deg(astray) > 0.7
-        assert beside_deg(RunFolder(folder).turned(astray)) < 0.4
+        assert beside_deg(RunFolder(folder).put_right(astray)) < 0.4
 
     def test_what_stops_in_the_second_search_goes_on_to_the_same_end(
         self, put_right: tuple[Path, list[FitEvent]], astray: Capture

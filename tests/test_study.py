@@ -148,6 +148,12 @@ class TestVariations:
             assert float(torch.rad2deg(turn.angle)) == pytest.approx(0.5, abs=1e-3)
             torch.testing.assert_close(before.camera.centre, after.camera.centre)
 
+    def test_photos_lie_a_pixel_beside_where_cameras_show_a_point(self, slider: Capture, photos: dict[str, Capture]):
+        for before, after in zip(slider.train[1], photos["off_centre"].train[1], strict=True):
+            point = before.camera.T_world_camera.apply(torch.tensor([0.1, 0.2, 2.0]))
+            shown, said = (view.camera.project(point)[0] for view in (before, after))
+            torch.testing.assert_close(shown - said, torch.tensor([1.0, -1.0]), atol=1e-4, rtol=0)
+
     def test_only_state_1_is_in_another_light(self, slider: Capture, photos: dict[str, Capture]):
         assert photos["warmer"].train[0] == slider.train[0]
         before, after = (c.train[1][0].rgba.astype(float) for c in (slider, photos["warmer"]))

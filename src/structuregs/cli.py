@@ -310,7 +310,7 @@ def _fit(
             page = stack.enter_context(LivePage(photos.name))
             print(f"look at {page.url}", flush=True)
         obj = _follow(events, page).obj
-        photos = RunFolder(run).turned(photos)
+        photos = RunFolder(run).put_right(photos)
         write_structure(photos, obj, run / "overview.png")
         report = write_report(run, photos, obj)
     _print_joints(obj)

@@ -102,6 +102,14 @@ class Capture:
         )
         return replace(self, train=(first, second))
 
+    def shifted(self, offset: Float32[Tensor, " 2"]) -> "Capture":
+        """The capture with the principal point of every camera moved, those of test views too (see `Camera.shifted`)."""
+        train, test = (
+            tuple(tuple(replace(v, camera=v.camera.shifted(offset)) for v in views) for views in states)
+            for states in (self.train, self.test)
+        )
+        return replace(self, train=train, test=test)
+
 
 def _area_mean(image: UInt16[np.ndarray, "H W C"], width: int, height: int) -> Float32[np.ndarray, "h w C"]:
     """Mean over the area of each pixel of the new size; exact for every ratio."""

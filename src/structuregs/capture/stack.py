@@ -33,6 +33,10 @@ class ImageStack:
         """The same images, each camera turned (see `Camera.turned`)."""
         return replace(self, cameras=tuple(c.turned(turn) for c, turn in zip(self.cameras, turns, strict=True)))
 
+    def shifted(self, offset: Float32[Tensor, " 2"]) -> "ImageStack":
+        """The same images, every camera's principal point moved (see `Camera.shifted`)."""
+        return replace(self, cameras=tuple(c.shifted(offset) for c in self.cameras))
+
     def __len__(self) -> int:
         return len(self.cameras)
 

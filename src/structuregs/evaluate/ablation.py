@@ -13,6 +13,7 @@ def ablations(capture: Capture, config: FitConfig, folder: Path, seed: int) -> l
     last = config.sizes[-1][1]
     rows = {
         "no_tint": ("no colour difference between the states", without_tint(config)),
+        "given_lens": ("principal point as given", replace(config, rates=replace(config.rates, principal_point=0.0))),
         "free_joints": ("motions not held to one degree of freedom", replace(config, one_joint_from=1.0)),
         "free_axes": ("joints not drawn to the base's axes", replace(config, along_base=0.0)),
         "no_surface": (

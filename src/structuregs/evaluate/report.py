@@ -17,8 +17,6 @@ from .images import psnr_on_views
 from .scores import JointScore, score_joints
 from .surfaces import SURFACE_PROTOCOLS, SurfaceScore, score_surfaces
 
-_FEWEST_TRAINING_VIEWS = 3  # evaluation looks at the test views only; a capture is read with three others or more
-
 
 @dataclass(frozen=True)
 class Protocol:
@@ -98,12 +96,10 @@ def evaluate_run(run: Path, *, truth: Path | None = None, protocol: str = "stric
         ValueError: the run holds no object, or its capture is not where it was.
     """
     obj = load_object(run / "object")
-    capture = load_capture(capture_of_run(run), views=_FEWEST_TRAINING_VIEWS)
+    capture = training_capture(run)
     folder = truth or find_truth(capture)
-    true, meshes = load_truth(folder) if folder else None, None
-    if true is not None and true.meshes:
-        capture = training_capture(run)
-        meshes = part_meshes(obj, capture)
+    true = load_truth(folder) if folder else None
+    meshes = part_meshes(obj, capture) if true is not None and true.meshes else None
     return evaluate_object(obj, capture, true, protocol=protocol, seconds=_seconds_of_run(run), meshes=meshes)
 
 
@@ -163,13 +159,13 @@ def capture_of_run(run: Path) -> Path:
 
 
 def training_capture(run: Path) -> Capture:
-    """The capture that a run was fitted to, with the training views that the fit had and their cameras as it turned them.
+    """The capture that a run was fitted to, with the training views that the fit had and cameras as it put them right.
 
     Raises:
         ValueError: the run's configuration, or the record of its cameras, is missing or damaged.
     """
     folder, views, seed = _configuration(run, "capture", "views", "seed")
-    return RunFolder(run).turned(load_capture(Path(folder), views=max(views), seed=seed))
+    return RunFolder(run).put_right(load_capture(Path(folder), views=max(views), seed=seed))
 
 
 def _configuration(run: Path, *names: str) -> list[Any]:

@@ -18,6 +18,7 @@ from .setting import Setting
 _PIXELS = 2  # by which masks are off
 _NOISE = 0.05  # standard deviation of colours in [0, 1]
 _ASTRAY_DEG = 0.5  # of the cameras
+_OFF_CENTRE = (1.0, -1.0)  # pixels by which photos lie beside their cameras, right and down
 _BRIGHTER = (1.2, 1.2, 1.2)  # factors on the channels of state 1
 _WARMER = (1.1, 1.0, 0.9)
 
@@ -32,6 +33,7 @@ def variations(capture: Capture, config: FitConfig, folder: Path, seed: int) -> 
         "masks_eroded": (f"masks eroded by {_PIXELS} pixels", partial(_each, change=_eroded)),
         "masks_dilated": (f"masks dilated by {_PIXELS} pixels", partial(_each, change=_dilated)),
         "cameras_astray": (f"cameras turned by {_ASTRAY_DEG:g} degrees", partial(_astray, seed=seed)),
+        "off_centre": ("principal points off by a pixel each way", partial(_each, change=_off_centre)),
         "brighter": (f"state 1 brighter by {_BRIGHTER[0]:g}", brighter),
         "warmer": ("state 1 in warmer light", warmer),
     }
@@ -90,6 +92,11 @@ def _astray(capture: Capture, seed: int) -> Capture:
         return replace(view, camera=view.camera.turned(np.deg2rad(_ASTRAY_DEG) * axis))
 
     return _each(capture, change)
+
+
+def _off_centre(view: View) -> View:
+    right, down = _OFF_CENTRE
+    return replace(view, camera=replace(view.camera, cx=view.camera.cx - right, cy=view.camera.cy - down))
 
 
 def _gained(capture: Capture, gains: tuple[float, float, float]) -> Capture:

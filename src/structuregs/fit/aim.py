@@ -1,4 +1,7 @@
-"""Cameras that point beside what their photos show, and the turns that put them right."""
+"""Cameras that point beside what their photos show: turns that put each right, and a principal point for all of them.
+
+That of a whole capture is off where two programs place the centres of pixels half a pixel apart, or where photos were cut.
+"""
 
 from collections.abc import Sequence
 
@@ -10,7 +13,7 @@ from torch import Tensor
 from ..capture import ImageStack, spread_cameras
 from ..geometry import Camera
 from ..model import PosedParts
-from ..raster import render
+from ..raster import Render, render
 
 _OUTLIER = 0.05  # errors of colour or coverage beyond this pull as much as this
 _SHAKY = 1e-3  # of the three directions' mean hold: a direction in which the photo holds the camera by less stays
@@ -49,6 +52,21 @@ def misaim(drawn: Float[Tensor, "H W C"], photo: Float[Tensor, "H W C"], camera:
     normal = torch.einsum("hwia,hwij,hwjb->ab", ways, hold, ways)
     damping = _SHAKY * normal.trace().clamp(min=1e-12) / 3 * torch.eye(3)
     return torch.linalg.solve(normal + damping, torch.einsum("hwia,hwi->a", ways, pull))
+
+
+def offset_gradient(picture: Render, camera: Camera) -> Float[Tensor, " 2"]:
+    """How the loss of a picture changes as the camera's principal point moves (see `Camera.shifted`); on the CPU.
+
+    All splats move alike on the image.
+
+    Args:
+        picture: after the backward pass, the gradient of its `projection.xy` retained.
+        camera: that it was drawn with.
+    """
+    gradient = picture.projection.xy.grad
+    if gradient is None:
+        raise ValueError("the picture has no gradients of where splats lie: retain those of projection.xy, then go back.")
+    return gradient.sum(0).cpu() * torch.tensor([camera.fx, camera.fy])
 
 
 @torch.no_grad()

@@ -18,8 +18,8 @@ from ..files import replacing
 from ..geometry import SE3, Camera, JointKind
 from ..joints import kind_of
 from ..model import PosedParts, Splats
-from ..raster import image_loss, render
-from .aim import beside, misaim, with_coverage
+from ..raster import Render, image_loss, render
+from .aim import beside, misaim, offset_gradient, with_coverage
 from .boxes import base_tightened, drawn_out, object_size, squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
@@ -36,6 +36,7 @@ _AIM = 0.5  # of the way that a photo asks for: the other photos speak too
 _SQUARE_WITHIN = float(np.sin(np.deg2rad(10))) ** 2
 _Value = TypeVar("_Value")
 _BOX_NAMES = ("box_quats", "box_centres", "log_half_extents")
+_POSE_NAMES = ("motions", "principal_point")
 # What torch raises over a file that was cut short or is something else, and what reading another record raises.
 _DAMAGED = (RuntimeError, EOFError, OSError, UnpicklingError, AttributeError, KeyError, TypeError, ValueError)
 
@@ -52,6 +53,7 @@ class FitState:
         free_motions: the K motions (wxyz_xyz) as they were when they were still free.
         size: of the object, about its radius, as the boxes had it before the first step; world units.
         step: steps done.
+        offset: by which the principal point of all cameras was moved (see `Camera.shifted`), a leaf for the optimiser.
         turns: by which the training cameras of either state were turned (see `Camera.turned`); None where they were right.
         anew: whether the fit has begun with the cameras already turned.
     """
@@ -63,6 +65,7 @@ class FitState:
     free_motions: Tensor
     size: float
     step: int
+    offset: Float[Tensor, " 2"]
     turns: tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]] | None = None
     anew: bool = False
 
@@ -74,11 +77,12 @@ class FitState:
         return FitState(
             variables,
             _no_moments(variables),
-            dict.fromkeys(variables.leaves, 0),
+            dict.fromkeys([*variables.leaves, "principal_point"], 0),
             gradients,
             parts.motions.wxyz_xyz.clone(),
             object_size(parts.boxes),
             0,
+            torch.zeros(2, requires_grad=True),
         )
 
     def save(self, file: Path) -> None:
@@ -96,6 +100,7 @@ class FitState:
             "free_motions": self.free_motions,
             "size": self.size,
             "step": self.step,
+            "offset": self.offset.detach(),
             "turns": self.turns,
             "anew": self.anew,
         }
@@ -116,13 +121,15 @@ class FitState:
             variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
             gradients = ScreenGradients(*r["gradients"])
             rest = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "turns", "anew")}
-            return FitState(variables, gradients=gradients, **rest)
+            offset = r["offset"].cpu().requires_grad_()
+            return FitState(variables, gradients=gradients, offset=offset, **rest)
         except _DAMAGED as error:
             raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
 
 
 def _no_moments(variables: Variables) -> dict[str, tuple[Tensor, Tensor]]:
-    return {name: (torch.zeros_like(leaf.detach()), torch.zeros_like(leaf.detach())) for name, leaf in variables.leaves.items()}
+    leaves = {name: leaf.detach() for name, leaf in variables.leaves.items()} | {"principal_point": torch.zeros(2)}
+    return {name: (torch.zeros_like(leaf), torch.zeros_like(leaf)) for name, leaf in leaves.items()}
 
 
 class Fitter:
@@ -168,7 +175,8 @@ class Fitter:
                     return
                 pair = (0, idle)
             s = self.state
-            self.state = replace(FitState.start(parts.joined(*pair)), size=s.size, step=step, turns=s.turns, anew=s.anew)
+            joined = FitState.start(parts.joined(*pair))
+            self.state = replace(joined, size=s.size, step=step, offset=s.offset, turns=s.turns, anew=s.anew)
             what = "a part that need not move is the base's" if idle else "two parts that move alike are one"
             yield Note(f"{what} from step {step} on; {len(parts) - 2} left")
 
@@ -224,13 +232,14 @@ class Fitter:
         return self.stacks[1]
 
     def _aimed_images(self) -> list[ImageStack]:
-        """`_images` with their cameras as they are turned by now."""
-        images = self._images()
+        """`_images` with their cameras as they are turned and shifted by now."""
+        images = [stack.shifted(self.state.offset) for stack in self._images()]
         return images if self.state.turns is None else [i.turned(t) for i, t in zip(images, self.state.turns, strict=True)]
 
     def _camera(self, stack: ImageStack, state: int, v: int) -> Camera:
-        """The camera of a view as it is turned by now."""
-        return stack.cameras[v] if self.state.turns is None else stack.cameras[v].turned(self.state.turns[state][v])
+        """The camera of a view as it is turned and shifted by now."""
+        camera = stack.cameras[v].shifted(self.state.offset)
+        return camera if self.state.turns is None else camera.turned(self.state.turns[state][v])
 
     def _step(self) -> tuple[float, float | None]:
         """One step of the optimiser; its loss and the images' PSNR."""
@@ -240,17 +249,20 @@ class Fitter:
         parts = variables.parts()
         if step < config.structure_until:
             loss = loss + self._structure_loss(parts)
-        renders = []
+        pictures = []
         if step >= config.image_from:
-            error, renders, psnr = self._image_loss(parts)
+            error, pictures, psnr = self._image_loss(parts)
             loss = loss + error
         loss.backward()
         if config.hypotheses:  # the base's box is known, and is no smaller for being hollow, as that of a table with its legs
             for name in _BOX_NAMES:
                 if (gradient := variables.leaves[name].grad) is not None:
                     gradient[0] = 0
-        for render_, size in renders:
-            self.state.gradients.add(render_.projection, size)
+        if step < config.growth.last * config.steps:
+            for picture, _ in pictures:
+                self.state.gradients.add(picture.projection, max(picture.alpha.shape) / config.image_weight)
+        if pictures and self._rate("principal_point"):
+            self.state.offset.grad = sum((offset_gradient(*picture) for picture in pictures), torch.zeros(2))
         self._adam()
         return float(loss.detach()), psnr
 
@@ -270,13 +282,12 @@ class Fitter:
             loose=loose,
         )
 
-    def _image_loss(self, parts: PosedParts) -> tuple[Tensor, list, float | None]:
+    def _image_loss(self, parts: PosedParts) -> tuple[Tensor, list[tuple[Render, Camera]], float | None]:
         config = self.config
-        growing = self.state.step < config.growth.last * config.steps
         posed = [parts.at_state(s) for s in (0, 1)]
         loss = self._priors(parts, posed)
         ssim_weight = self._in_force(config.ssim_weights)
-        renders, squares = [], []
+        pictures, squares = [], []
         for s, stack in enumerate(self._images()):
             v = self._view(s, len(stack))
             rgb, alpha = (image.to(self.device) for image in stack.target(v))
@@ -285,15 +296,14 @@ class Fitter:
             if self.state.turns is not None:
                 drawn, photo = with_coverage(picture.rgb, picture.alpha), with_coverage(rgb, alpha)
                 self.state.turns[s][v] += _AIM * misaim(drawn, photo, camera)
-            if growing:
-                picture.projection.xy.retain_grad()
-                renders.append((picture, max(picture.alpha.shape) / config.image_weight))
+            picture.projection.xy.retain_grad()
+            pictures.append((picture, camera))
             loss = loss + config.image_weight * image_loss(
                 picture.rgb, picture.alpha, rgb, alpha, ssim_weight=ssim_weight, alpha_weight=config.alpha_weight
             )
             if (self.state.step + 1) % _REPORT_EVERY == 0:
                 squares.append(float((picture.rgb.detach() - rgb).square().mean()))
-        return loss, renders, -10 * float(np.log10(max(np.mean(squares), 1e-12))) if squares else None
+        return loss, pictures, -10 * float(np.log10(max(np.mean(squares), 1e-12))) if squares else None
 
     def _priors(self, parts: PosedParts, posed: Sequence[Splats]) -> Tensor:
         """What is likelier whatever the photos say; posed: the splats in both states."""
@@ -320,26 +330,29 @@ class Fitter:
         done = max(0, self.state.step - config.image_from) / max(1, config.steps - config.image_from)
         if name in _BOX_NAMES:  # without the losses on boxes only splats and motions have something to explain
             return rates.boxes * rates.poses_final**done if self.state.step < config.structure_until else 0.0
-        if name == "motions" and self.state.step < config.motions_from * config.steps:
+        if name in _POSE_NAMES and self.state.step < config.motions_from * config.steps:
             return 0.0
-        final = {"means": rates.means_final, "motions": rates.poses_final}.get(name, rates.appearance_final)
+        if name == "principal_point" and self.state.turns is not None:  # turns put every photo right by itself
+            return 0.0
+        finals = {"means": rates.means_final} | dict.fromkeys(_POSE_NAMES, rates.poses_final)
+        final = finals.get(name, rates.appearance_final)
         return getattr(rates, name) * final**done
 
     @torch.no_grad()
     def _adam(self) -> None:
         """Adam (Kingma and Ba 2015), leaf by leaf.
 
-        A motion's six directions share one second moment: scaled each by itself, those of which the photos say little would be
-        driven about by noise as fast as the others move for a reason.
+        A motion's six directions share one second moment, and so do the two of the principal point: scaled each by itself,
+        those of which the photos say little would be driven about by noise as fast as the others move for a reason.
         """
-        for name, leaf in self.state.variables.leaves.items():
+        for name, leaf in [*self.state.variables.leaves.items(), ("principal_point", self.state.offset)]:
             rate = self._rate(name)
             if leaf.grad is not None and rate:
                 self.state.taken[name] = t = self.state.taken[name] + 1
                 first, second = self.state.moments[name]
                 first.lerp_(leaf.grad, 0.1)
                 square = leaf.grad.square()
-                second.lerp_(square.mean(-1, keepdim=True).expand_as(square) if name == "motions" else square, 0.001)
+                second.lerp_(square.mean(-1, keepdim=True).expand_as(square) if name in _POSE_NAMES else square, 0.001)
                 correction = np.sqrt(1 - 0.999**t) / (1 - 0.9**t)
                 leaf.addcdiv_(first, second.sqrt().add_(1e-15), value=-rate * correction)
             leaf.grad = None

@@ -160,9 +160,9 @@ def fit_run(
         clock.save()
     fitter = Fitter(capture, config, state, seed, chosen)
     yield from _all_steps(fitter, folder, clock, begin)
-    if fitter.state.turns is not None:
-        folder.keep_turns(fitter.state.turns, capture)
-    photos = folder.turned(capture)
+    if config.rates.principal_point or fitter.state.turns is not None:
+        folder.keep_cameras(fitter.state.offset.detach(), fitter.state.turns, capture)
+    photos = folder.put_right(capture)
     obj = finished_object(fitter.state)
     for evidence in (seen_in_both, covered_in_both, alike_in_both):
         obj = evidence(obj, photos)

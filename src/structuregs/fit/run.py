@@ -15,6 +15,8 @@ from ..capture import Capture
 from ..files import replace_file
 from .events import Step
 
+_OFF_CENTRE = 0.4  # pixels: a principal point that was off by so much, such as half a pixel, is worth a sentence
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -44,7 +46,7 @@ class RunFolder:
 
     @property
     def cameras(self) -> Path:
-        """By how much the cameras were turned; not there where they were right."""
+        """How the cameras were put right; not there where the fit took them as they were."""
         return self.root / "cameras.json"
 
     @property
@@ -84,8 +86,8 @@ class RunFolder:
         """Seconds spent so far."""
         return json.loads(self.timing.read_text())["total"] if self.timing.exists() else 0.0
 
-    def turned(self, capture: Capture) -> Capture:
-        """The capture that the run was fitted to, its training cameras turned as the fit has turned them.
+    def put_right(self, capture: Capture) -> Capture:
+        """The capture that the run was fitted to, its cameras as the fit has put them right: turns are of training views only.
 
         Raises:
             ValueError: `cameras` is damaged, or of another capture.
@@ -93,25 +95,43 @@ class RunFolder:
         if not self.cameras.exists():
             return capture
         try:
-            states = json.loads(self.cameras.read_text())["turns"]
+            record = json.loads(self.cameras.read_text())
+            shifted = capture.shifted(torch.tensor(record["principal_point"]).reshape(2))
+            if "turns" not in record:
+                return shifted
             turns = [
-                torch.tensor([states[s][view.name] for view in views]).reshape(len(views), 3)
+                torch.tensor([record["turns"][s][view.name] for view in views]).reshape(len(views), 3)
                 for s, views in enumerate(capture.train)
             ]
         except (ValueError, KeyError, IndexError, TypeError, RuntimeError) as error:
-            raise ValueError(f"{self.cameras}: not the turns of this capture's cameras ({error!r}); fit again.") from error
-        return capture.turned(turns)
+            raise ValueError(f"{self.cameras}: does not say how this capture's cameras are ({error!r}); fit again.") from error
+        return shifted.turned(turns)
 
-    def keep_turns(self, turns: Sequence[Float[Tensor, "_ 3"]], capture: Capture) -> None:
-        """Writes `cameras`, and adds to `notes` how far they were off."""
-        states = [
-            {view.name: turn for view, turn in zip(views, state.tolist(), strict=True)}
-            for views, state in zip(capture.train, turns, strict=True)
-        ]
-        replace_file(self.cameras, json.dumps({"turns": states}, indent=1) + "\n")
-        degrees = float(torch.cat(list(turns)).norm(dim=-1).median().rad2deg())
-        note = f"cameras pointed {degrees:.2f} degrees beside their photos (median) and were turned"
-        self.keep_sentences(list(dict.fromkeys([*self.sentences(), note])))
+    def keep_cameras(self, offset: Float[Tensor, " 2"], turns: Sequence[Float[Tensor, "_ 3"]] | None, capture: Capture) -> None:
+        """Writes `cameras`, and adds to `notes` how far they were off where that is clear to see.
+
+        Args:
+            offset: of every camera's principal point (see `Camera.shifted`).
+            turns: of the training cameras of either state; None where none was turned.
+            capture: that was fitted.
+        """
+        record: dict[str, Any] = {"principal_point": offset.tolist()}
+        camera, notes = capture.train[0][0].camera, []
+        right, down = (offset * torch.tensor([camera.fx, camera.fy])).tolist()
+        if max(abs(right), abs(down)) >= _OFF_CENTRE:
+            beside = f"{abs(right):.2f} pixels {'right' if right > 0 else 'left'} of"
+            over = f"{abs(down):.2f} {'below' if down > 0 else 'above'}"
+            notes.append(f"all photos lie {beside} and {over} what their cameras show: the principal point was moved")
+        if turns is not None:
+            record["turns"] = [
+                {view.name: turn for view, turn in zip(views, state.tolist(), strict=True)}
+                for views, state in zip(capture.train, turns, strict=True)
+            ]
+            degrees = float(torch.cat(list(turns)).norm(dim=-1).median().rad2deg())
+            notes.append(f"cameras pointed {degrees:.2f} degrees beside their photos (median) and were turned")
+        replace_file(self.cameras, json.dumps(record, indent=1) + "\n")
+        if notes:
+            self.keep_sentences(list(dict.fromkeys([*self.sentences(), *notes])))
 
     def sentences(self) -> list[str]:
         """The sentences of `notes`; none where it is not there."""

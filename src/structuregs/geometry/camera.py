@@ -37,6 +37,11 @@ class Camera:
         pose = self.T_world_camera.wxyz_xyz
         return replace(self, T_world_camera=self.T_world_camera @ SE3.exp(torch.cat([torch.zeros(3), turn]).to(pose)))
 
+    def shifted(self, offset: Float[Tensor, " 2"]) -> "Camera":
+        """The camera with its principal point moved to the right and down; in focal lengths, as for images of any size."""
+        x, y = offset.tolist()
+        return replace(self, cx=self.cx + self.fx * x, cy=self.cy + self.fy * y)
+
     @property
     def K(self) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix, pixels."""
