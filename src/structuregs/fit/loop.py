@@ -120,9 +120,12 @@ class FitState:
             leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
             variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
             gradients = ScreenGradients(*r["gradients"])
-            rest = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "turns", "anew")}
-            offset = r["offset"].cpu().requires_grad_()
-            return FitState(variables, gradients=gradients, offset=offset, **rest)
+            rest = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "anew")}
+            # Cameras are on the CPU whatever the device.
+            offset, turns = r["offset"].cpu().requires_grad_(), r["turns"] and tuple(t.cpu() for t in r["turns"])
+            first, second = rest["moments"]["principal_point"]
+            rest["moments"]["principal_point"] = (first.cpu(), second.cpu())
+            return FitState(variables, gradients=gradients, offset=offset, turns=turns, **rest)
         except _DAMAGED as error:
             raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
 
