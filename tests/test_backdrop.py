@@ -26,14 +26,17 @@ WHITE = torch.ones(3)
 PLACES = [(0.3, 0.1, 0.2), (1.4, -0.9, 0.0), (-0.5, 0.5, -1.5), (0.0, 0.0, 0.9)]
 
 
+@pytest.mark.parametrize("dilation", [0.1, 0.5])
 @pytest.mark.parametrize("place", PLACES)
-def test_a_patch_is_a_cut_of_the_whole_picture_and_elsewhere_nothing_changes(place: tuple[float, float, float]):
+def test_a_patch_is_a_cut_of_the_whole_picture_and_elsewhere_nothing_changes(
+    place: tuple[float, float, float], dilation: float
+):
     few = splats(20, place, 0.1, 1)
-    patch = Backdrop(STAYING, CAMERA).with_others(few)
-    whole = render(Splats.concatenate([STAYING, few]), CAMERA)
+    patch = Backdrop(STAYING, CAMERA, dilation).with_others(few)
+    whole = render(Splats.concatenate([STAYING, few]), CAMERA, dilation=dilation)
     drawn = patch.drawn(WHITE)
     for name in ("rgb", "alpha", "depth"):
-        expected = getattr(render(STAYING, CAMERA), name).clone()
+        expected = getattr(render(STAYING, CAMERA, dilation=dilation), name).clone()
         expected[patch.rows, patch.columns] = getattr(drawn, name)
         torch.testing.assert_close(expected, getattr(whole, name), atol=1e-5, rtol=0)
     assert drawn.alpha.numel() < 0.5 * whole.alpha.numel()

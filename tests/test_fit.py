@@ -4,7 +4,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from torch import Tensor
 
@@ -134,6 +136,35 @@ class TestVariables:
             assert leaf.grad is not None, name
             assert leaf.grad.abs().sum() > 0, name
 
+    @pytest.mark.parametrize("share", [0.5, 0.8])
+    def test_a_part_gives_way_in_state_0_to_what_its_motion_changes_by(self, share: float):
+        parts = turned_parts()
+        variables = Variables.of(parts, share)
+        rows = 0.1 * torch.randn(3, 6, generator=torch.Generator().manual_seed(1))
+        with torch.no_grad():
+            variables.leaves["motions"].copy_(rows)
+        after = variables.parts().detach()
+        for k in range(3):
+            before = parts.motions[k].as_matrix().double()
+            change = scipy.linalg.logm((torch.linalg.inv(before) @ after.motions[k].as_matrix().double()).numpy())
+            gone_back = torch.from_numpy(scipy.linalg.expm(-share * np.real(change))).float()
+            expected = gone_back @ parts.boxes.T_world_box[k].as_matrix()
+            torch.testing.assert_close(after.boxes.T_world_box[k].as_matrix(), expected, atol=2e-5, rtol=0)
+        torch.testing.assert_close(after.boxes.half_extents, parts.boxes.half_extents)
+
+    @pytest.mark.parametrize("share", [0.0, 0.5])
+    def test_boxes_are_where_they_are_set_and_stay_there_when_motions_are_held(self, share: float):
+        parts = turned_parts()
+        variables = Variables.of(parts, share)
+        with torch.no_grad():
+            variables.leaves["motions"].copy_(0.1 * torch.randn(3, 6, generator=torch.Generator().manual_seed(2)))
+        other = Box(SE3.exp(torch.randn(3, 6, generator=torch.Generator().manual_seed(3))), parts.boxes.half_extents * 1.5)
+        variables.set_boxes(other)
+        same_motion(variables.parts().boxes.T_world_box, other.T_world_box, atol=1e-5)
+        torch.testing.assert_close(variables.parts().boxes.half_extents, other.half_extents)
+        variables.hold(["revolute", "prismatic"])
+        same_motion(variables.parts().boxes.T_world_box, other.T_world_box, atol=1e-5)
+
     def test_an_object_without_joints_can_be_held(self):
         variables = Variables.of(made_of().parts)
         variables.hold([])
@@ -262,7 +293,7 @@ class TestDensification:
 
 def fitter(config: FitConfig, parts: PosedParts = DOOR_AND_DRAWER) -> Fitter:
     capture = photographed(made_of(DOOR.motion(), DRAWER.motion()))
-    return Fitter(capture, config, FitState.start(parts), 0, torch.device("cpu"))
+    return Fitter(capture, config, FitState.start(parts, config.give_way), 0, torch.device("cpu"))
 
 
 QUICK = FitConfig(

@@ -42,12 +42,12 @@ def make_camera(width, height):
     return Camera(pose, 1.2 * width, 1.1 * width, 0.52 * width, 0.47 * height, width, height)
 
 
-def results(splats, camera, backend, dtype, parts=("rgb", "alpha", "depth"), seed=5):
+def results(splats, camera, backend, dtype, parts=("rgb", "alpha", "depth"), seed=5, **how):
     """Images of a back end, and the gradients of a random linear function of some of them."""
     generator = torch.Generator().manual_seed(seed)
     tensors = {name: value.to(dtype).clone().requires_grad_() for name, value in splats.tensors().items()}
     background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, requires_grad=True)
-    image = render(Splats(**tensors), camera, background=background, backend=backend)
+    image = render(Splats(**tensors), camera, background=background, backend=backend, **how)
     image.projection.xy.retain_grad()
     loss = torch.zeros((), dtype=dtype)
     for part in ("rgb", "alpha", "depth"):
@@ -60,10 +60,10 @@ def results(splats, camera, backend, dtype, parts=("rgb", "alpha", "depth"), see
     return values, gradients | {"background": background.grad, "xy": image.projection.xy.grad}
 
 
-def assert_same(splats, camera, parts=("rgb", "alpha", "depth"), tolerance=1e-4):
+def assert_same(splats, camera, parts=("rgb", "alpha", "depth"), tolerance=1e-4, **how):
     """Values to 1e-5 and gradients to a share of their largest entry."""
-    values, gradients = results(splats, camera, "cpu", torch.float32, parts)
-    expected_values, expected_gradients = results(splats, camera, "reference", torch.float64, parts)
+    values, gradients = results(splats, camera, "cpu", torch.float32, parts, **how)
+    expected_values, expected_gradients = results(splats, camera, "reference", torch.float64, parts, **how)
     for name, value in values.items():
         torch.testing.assert_close(
             value.double(), expected_values[name], rtol=1e-5, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}"
@@ -86,6 +86,13 @@ def test_values_and_every_gradient_are_the_references(width, height, degree, n):
 @pytest.mark.parametrize("part", ["rgb", "alpha", "depth"])
 def test_gradients_through_one_image_alone(part):
     assert_same(make_splats(100), make_camera(40, 30), (part,))
+
+
+def test_splats_widened_by_more_on_the_image():
+    splats, camera = make_splats(100, log_scale=-4.0), make_camera(40, 30)
+    assert_same(splats, camera, dilation=0.3)
+    areas = [float(render(splats, camera, dilation=d).projection.radius.square().mean()) for d in (0.1, 0.3)]
+    assert areas[1] > 1.2 * areas[0]
 
 
 def test_long_thin_splats_reach_every_pixel_they_should():

@@ -33,10 +33,12 @@ def draw(splats, camera, background=WHITE):
     return render(splats, camera, background=background, backend="reference")
 
 
-def test_a_round_splat_on_the_axis_is_a_gaussian_of_its_projected_size():
-    camera = camera_at_origin()
-    image = draw(make_splats([[0.0, 0, 4]], [0.05], [0.8], [[1.0, 0, 0]]), camera)
-    variance = (100 * 0.05 / 4) ** 2 + 0.3
+@pytest.mark.parametrize("dilation", [None, 0.3])
+def test_a_round_splat_on_the_axis_is_a_gaussian_of_its_projected_size(dilation: float | None):
+    splats = make_splats([[0.0, 0, 4]], [0.05], [0.8], [[1.0, 0, 0]])
+    asked = {} if dilation is None else {"dilation": dilation}
+    image = render(splats, camera_at_origin(), background=WHITE, backend="reference", **asked)
+    variance = (100 * 0.05 / 4) ** 2 + (dilation or 1 / 12)  # of a pixel's square, unless asked otherwise
     x, y = torch.meshgrid(torch.arange(9) - 4.0, torch.arange(7) - 3.0, indexing="xy")
     expected = 0.8 * torch.exp(-(x * x + y * y).double() / (2 * variance))
     torch.testing.assert_close(image.alpha, torch.where(expected >= 1 / 255, expected, 0.0))
@@ -90,7 +92,7 @@ def test_the_projected_covariance_is_that_of_projected_samples():
     noise = torch.randn(400_000, 3, generator=generator).double() * splats.scales
     points = splats.means + noise @ quat_to_matrix(splats.quats)[0].T
     pixels, depths = camera.project(points)
-    projection = project(splats, camera)
+    projection = project(splats, camera, 0.3)
     xx, xy, yy = projection.conic[0]
     covariance = torch.linalg.inv(torch.stack([xx, xy, xy, yy]).view(2, 2)) - 0.3 * torch.eye(2).double()
     torch.testing.assert_close(covariance, torch.cov(pixels.T), rtol=0.01, atol=0.05)
@@ -106,7 +108,7 @@ def test_colour_follows_the_direction_from_the_camera():
     x, y, z = torch.nn.functional.normalize(-pose.xyz, dim=0)
     c = math.sqrt(3 / (4 * math.pi))
     expected = 0.5 + c * torch.stack([-0.1 * y, 0.2 * z, -0.3 * x])
-    torch.testing.assert_close(project(splats, camera_at_origin(pose=pose)).rgb[0], expected)
+    torch.testing.assert_close(project(splats, camera_at_origin(pose=pose), 0.3).rgb[0], expected)
 
 
 def test_gradients_are_those_of_finite_differences():

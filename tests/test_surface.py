@@ -16,7 +16,7 @@ CAMERA = Camera(SE3.identity(), 70.0, 70.0, 32.0, 32.0, 64, 64)
 
 def wall(normal: torch.Tensor, distance: float, bumps: float = 0.0) -> Splats:
     """Discs of 0.06 that fill the view with the plane normal . x = distance, their centres up to `bumps` off along z."""
-    steps = torch.linspace(-2.5, 2.5, 101)
+    steps = torch.linspace(-3, 3, 121)
     x, y = (axis.reshape(-1) for axis in torch.meshgrid(steps, steps, indexing="ij"))
     z = (distance - normal[0] * x - normal[1] * y) / normal[2]
     z = z + bumps * (2 * torch.rand(len(z), generator=torch.Generator().manual_seed(0)) - 1)

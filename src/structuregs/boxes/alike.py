@@ -21,6 +21,7 @@ from ..capture import ImageStack, spread_cameras
 from ..geometry import SE3, Box
 from ..model import Splats
 from ..raster import coverage_of, render_surface
+from .appearance import LOOK_DILATION
 
 _VIEWS = 48  # photos of the one state, each laid upon...
 _NEIGHBOURS = 4  # ...so many of the other's: those that see the part most nearly alike,...
@@ -81,7 +82,7 @@ class Shown:
     def depth(self, v: int) -> Float32[np.ndarray, "H W"]:
         """Of the surface in a photo; 0 where there is none."""
         if v not in self._depths:
-            self._depths[v] = render_surface(self.splats, self.stack.cameras[v]).depth
+            self._depths[v] = render_surface(self.splats, self.stack.cameras[v], LOOK_DILATION).depth
         return self._depths[v]
 
     def clear(self, v: int) -> Bool[np.ndarray, "H W"]:
@@ -90,7 +91,7 @@ class Shown:
             solid = self.depth(v) > 0
             if self.part is not None:
                 with torch.no_grad():
-                    solid &= coverage_of(self.splats, self.part, self.stack.cameras[v]).numpy() > _CLEAR
+                    solid &= coverage_of(self.splats, self.part, self.stack.cameras[v], LOOK_DILATION).numpy() > _CLEAR
                 solid = ndimage.binary_erosion(solid)
             self._clear[v] = solid
         return self._clear[v]

@@ -13,6 +13,10 @@ from ..model import Splats
 from ..points import Hull
 from ..raster import image_loss, render
 
+LOOK_DILATION = 0.3
+"""As `raster.render`'s, px^2, of all pictures of quick looks: their splats are few and coarse, and what is searched with
+them is found from farther away where edges are soft."""
+
 
 @dataclass(frozen=True)
 class AppearanceConfig:
@@ -59,7 +63,7 @@ def fit_state(stack: ImageStack, hull: Hull, config: AppearanceConfig, seed: int
         for group, rate in zip(optimiser.param_groups, rates.values(), strict=True):
             group["lr"] = rate * 0.1 ** (step / config.steps)
         rgb, alpha = stack.target(v)
-        picture = render(splats, stack.cameras[v])
+        picture = render(splats, stack.cameras[v], dilation=LOOK_DILATION)
         loss = image_loss(picture.rgb, picture.alpha, rgb, alpha, ssim_weight=0.0, alpha_weight=0.5)
         optimiser.zero_grad()
         loss.backward()
@@ -80,7 +84,7 @@ def surface_points(splats: Splats, stack: ImageStack, hull: Hull, looks: int) ->
     """
     hits = []
     for v in spread_cameras(stack.cameras, looks):
-        picture = render(splats, stack.cameras[v])
+        picture = render(splats, stack.cameras[v], dilation=LOOK_DILATION)
         origin, rays = stack.cameras[v].rays()
         # Where depth jumps from one pixel to the next, its mean lies in the air between.
         clear = (_bend(picture.depth) < 1.5 * hull.voxel) & (picture.alpha > 0.8)

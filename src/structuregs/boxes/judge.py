@@ -15,6 +15,7 @@ from ..geometry import SE3, Box, Screw, screw_at
 from ..joints import kind_of
 from ..model import Splats
 from ..raster import Backdrop, Render, image_loss
+from .appearance import LOOK_DILATION
 from .cue import StateLook
 from .hypotheses import Hypothesis, oddity, turn_about
 
@@ -54,7 +55,7 @@ class Scene:
     def _without(self, v: int) -> tuple[Backdrop, Float[Tensor, "H W"]]:
         """The rest as it stands in a photo, and the photo's errors without the part."""
         if v not in self._seen:
-            backdrop = Backdrop(self.rest, self.look.stack.cameras[v])
+            backdrop = Backdrop(self.rest, self.look.stack.cameras[v], LOOK_DILATION)
             picture = backdrop.drawn(self.rest.means.new_ones(3))
             self._seen[v] = backdrop, _errors(picture, *self.look.stack.target(v)).detach()
         return self._seen[v]

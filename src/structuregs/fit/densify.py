@@ -1,6 +1,6 @@
 """Densification and pruning as in 3DGS; a child stays in its parent's box (supplement 1.2)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -72,13 +72,14 @@ def prune_mask(variables: Variables, growth: Growth, size: float) -> Bool[Tensor
         growth: thresholds.
         size: of the object, world units.
     """
-    leaves, boxes = variables.leaves, variables.boxes()
+    leaves, motions = variables.leaves, variables.motions()
+    boxes = variables.boxes(motions)
     opaque = torch.sigmoid(leaves["logit_opacities"]) > growth.faint
     reach = 1 + growth.reach * size * (-leaves["log_half_extents"]).exp()
     near = (leaves["means"].abs() < reach[part_index(variables.counts, opaque.device)]).all(-1)
     base = leaves["means"][: variables.counts[0]]
     out = (base.abs() > 1).any(-1)
-    near[: len(base)] &= ~(out & in_moving_box(boxes[0].to_world(base), boxes, variables.motions(), _BESIDE * size))
+    near[: len(base)] &= ~(out & in_moving_box(boxes[0].to_world(base), boxes, motions, _BESIDE * size))
     return opaque & near
 
 
@@ -145,5 +146,5 @@ def grow(
     order = torch.argsort(part[source] * _CELLS**3 + _along_curve(leaves["means"]), stable=True)
     leaves = {name: value[order].requires_grad_() for name, value in leaves.items()}
     counts = tuple(int(n) for n in torch.bincount(part[source], minlength=len(variables.counts)))
-    grown = Variables(variables.leaves | leaves, counts, variables.kinds, variables.start, variables.centres)
+    grown = replace(variables, leaves=variables.leaves | leaves, counts=counts)
     return grown, source[order], fresh[order]

@@ -70,9 +70,9 @@ class FitState:
     anew: bool = False
 
     @staticmethod
-    def start(parts: PosedParts) -> "FitState":
-        """The state before the first step."""
-        variables = Variables.of(parts)
+    def start(parts: PosedParts, give_way: float = 0.0) -> "FitState":
+        """The state before the first step; give_way: see `Variables`."""
+        variables = Variables.of(parts, give_way)
         gradients = ScreenGradients.zeros(sum(parts.counts), parts.tint.device)
         return FitState(
             variables,
@@ -91,6 +91,7 @@ class FitState:
         record = {
             "leaves": {name: leaf.detach() for name, leaf in v.leaves.items()},
             "counts": v.counts,
+            "give_way": v.give_way,
             "kinds": v.kinds,
             "start": v.start,
             "centres": v.centres,
@@ -118,7 +119,7 @@ class FitState:
         try:
             r = torch.load(content, map_location=device, weights_only=True)
             leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
-            variables = Variables(leaves, tuple(r["counts"]), r["kinds"], r["start"], r["centres"])
+            variables = Variables(leaves, tuple(r["counts"]), r["give_way"], r["kinds"], r["start"], r["centres"])
             gradients = ScreenGradients(*r["gradients"])
             rest = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "anew")}
             # Cameras are on the CPU whatever the device.
@@ -178,7 +179,7 @@ class Fitter:
                     return
                 pair = (0, idle)
             s = self.state
-            joined = FitState.start(parts.joined(*pair))
+            joined = FitState.start(parts.joined(*pair), self.config.give_way)
             self.state = replace(joined, size=s.size, step=step, offset=s.offset, turns=s.turns, anew=s.anew)
             what = "a part that need not move is the base's" if idle else "two parts that move alike are one"
             yield Note(f"{what} from step {step} on; {len(parts) - 2} left")
@@ -198,11 +199,11 @@ class Fitter:
 
         The base's is also made tight, and those of what moves are drawn out where splats press on.
         """
-        leaves, reach = self.state.variables.leaves, self.config.growth.reach * self.state.size
-        parts = drawn_out(base_tightened(squared_up(self.state.variables.parts())), reach)
-        for name, value in Variables.of(parts).leaves.items():
-            if name != "motions":
-                leaves[name].copy_(value)
+        variables, reach = self.state.variables, self.config.growth.reach * self.state.size
+        parts = drawn_out(base_tightened(squared_up(variables.parts())), reach)
+        for name in ("means", "quats", "sh"):
+            variables.leaves[name].copy_(getattr(parts.splats, name))
+        variables.set_boxes(parts.boxes)
 
     def _settle_joints(self) -> Iterator[FitEvent]:
         """Holds every motion to one degree of freedom once its time has come."""
@@ -273,10 +274,13 @@ class Fitter:
         views = [self._view(s, len(stack)) for s, stack in enumerate(self.masks)]
         cameras = (self._camera(self.masks[0], 0, views[0]), self._camera(self.masks[1], 1, views[1]))
         masks = [stack.target(v)[1].to(self.device) for stack, v in zip(self.masks, views, strict=True)]
-        motions = parts.motions if self.config.motions_with_structure else SE3(parts.motions.wxyz_xyz.detach())
+        boxes, motions = parts.boxes, parts.motions
+        if not self.config.motions_with_structure:
+            motions = SE3(motions.wxyz_xyz.detach())
+            boxes = self.state.variables.boxes(motions)
         loose = self.state.step < self.config.loose_until
         return structure_loss(
-            parts.boxes,
+            boxes,
             motions,
             cameras,
             (masks[0], masks[1]),

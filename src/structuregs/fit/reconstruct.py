@@ -206,7 +206,7 @@ def _begin(
     """The state before the first step, which is also the run's checkpoint, the cameras turned if they have to be."""
     photos = capture if turns is None else capture.turned(turns)
     begun = yield from _noted(start_parts(photos, config, parts=parts, points=points, seed=seed), folder)
-    state = replace(FitState.start(begun.to(device)), turns=turns, anew=turns is not None)
+    state = replace(FitState.start(begun.to(device), config.give_way), turns=turns, anew=turns is not None)
     folder.cut_metrics(0)
     state.save(folder.checkpoint)
     return state

@@ -88,6 +88,9 @@ class FitConfig:
     aim_at: float = 0.15
     """Part of the fit at which, once photos are compared, those that lie beside their cameras' pictures have the cameras
     turned, from then on; 1 for never."""
+    give_way: float = 0.5
+    """Share of every change of a motion that state 0 gives way by, so that both states move towards each other: splats settle
+    half-way between what the two ask for, and would else hold a motion back; 0 to move state 1 alone, as in the supplement."""
     motions_with_structure: bool = False
     """Whether the losses on boxes move the motions too, from `motions_from` on."""
     sizes: tuple[tuple[float, int], ...] = ((0.0, 160), (0.35, 256), (0.65, 400), (0.92, 800))
@@ -97,8 +100,8 @@ class FitConfig:
     ssim_weights: tuple[tuple[float, float], ...] = ((0.0, 0.05), (0.65, 0.2))
     """(part of the fit, share) from which on D-SSIM has that share of the image loss.  While texture is finer than the splats
     it throws turns off; afterwards surfaces come out better with 3DGS's .2 than with less."""
-    alpha_weight: float = 0.5
-    """Of the mask's error beside the colour's."""
+    alpha_weight: float = 2.0
+    """Of the mask's error beside the colour's: outlines are what holds a motion, and masks show them sharpest."""
     tint_penalty: float = 0.3
     """Of the mean absolute colour difference between the states."""
     opacity_penalty: float = 0.2
@@ -153,6 +156,7 @@ PRESETS: dict[str, FitConfig] = {
         image_from=400,
         motions_from=0.0,
         aim_at=1.0,
+        give_way=0.0,
         motions_with_structure=True,
         sizes=((0.0, 1600),),
         ssim_weights=((0.0, 0.2),),

@@ -21,21 +21,24 @@ class Variables:
         leaves: the splats' tensors (`SPLAT_NAMES`), `box_quats`, `box_centres`, `log_half_extents` (K rows), `motions`
             (K rows of 6: see `kinds`).
         counts: splats of each part.
+        give_way: share of what a motion has changed by since `start` that its part, as the leaves have it, has gone back by
+            in state 0.
         kinds: None while motions are free: then a row of `motions` is a tangent (v, omega) about the part's centre, on top
             of `start`.  Afterwards the type of each moving part: a row is then the rotation vector and a point of its axis
             (revolute), or the translation and zeros (prismatic).
-        start: K motions (wxyz_xyz) from which free motions count.
+        start: K motions (wxyz_xyz) from which changes, and the rows of free motions, count.
         centres: K points about which free motions turn, as they stand in state 1.
     """
 
     leaves: dict[str, Tensor]
     counts: tuple[int, ...]
+    give_way: float
     kinds: tuple[JointKind, ...] | None
     start: Float[Tensor, "K 7"]
     centres: Float[Tensor, "K 3"]
 
     @staticmethod
-    def of(parts: PosedParts) -> "Variables":
+    def of(parts: PosedParts, give_way: float = 0.0) -> "Variables":
         """Variables whose values are the given parts."""
         parts = parts.detach()
         pose = parts.boxes.T_world_box
@@ -47,12 +50,26 @@ class Variables:
             "motions": torch.zeros(len(parts), 6, device=pose.xyz.device),
         }
         leaves = {name: value.clone().contiguous().requires_grad_() for name, value in leaves.items()}
-        return Variables(leaves, parts.counts, None, parts.motions.wxyz_xyz.clone(), parts.motions.apply(pose.xyz))
+        return Variables(leaves, parts.counts, give_way, None, parts.motions.wxyz_xyz.clone(), parts.motions.apply(pose.xyz))
 
-    def boxes(self) -> Box:
-        """The boxes in state 0."""
+    def boxes(self, motions: SE3) -> Box:
+        """The boxes in state 0, which have given way to the motions."""
         pose = SE3.from_quat(self.leaves["box_quats"], self.leaves["box_centres"])
+        if self.give_way:
+            pose = self._way_back(motions) @ pose
         return Box(pose, self.leaves["log_half_extents"].exp())
+
+    def _way_back(self, motions: SE3) -> SE3:
+        """What poses in state 0 have been moved by, as the motions have changed from `start`."""
+        return SE3.exp(-self.give_way * (SE3(self.start).inverse() @ motions).log())
+
+    def set_boxes(self, boxes: Box) -> None:
+        """Sets the leaves so that the boxes in state 0 are these, the motions being as they are."""
+        with torch.no_grad():
+            pose = self._way_back(self.motions()).inverse() @ boxes.T_world_box
+            self.leaves["box_quats"].copy_(pose.wxyz)
+            self.leaves["box_centres"].copy_(pose.xyz)
+            self.leaves["log_half_extents"].copy_(boxes.half_extents.log())
 
     def motions(self) -> SE3:
         """The motions; the base's is the identity whatever its row says."""
@@ -75,20 +92,23 @@ class Variables:
     def parts(self) -> PosedParts:
         """The posed parts, with gradients to the leaves."""
         splats = Splats(**{name: self.leaves[name] for name in SPLAT_NAMES if name != "tint"})
-        return PosedParts(self.boxes(), self.motions(), splats, self.counts, self.leaves["tint"])
+        motions = self.motions()
+        return PosedParts(self.boxes(motions), motions, splats, self.counts, self.leaves["tint"])
 
     def hold(self, kinds: Sequence[JointKind]) -> None:
         """From here on every motion has its joint's one degree of freedom; the leaf `motions` is set in place."""
         rows = torch.zeros_like(self.leaves["motions"])
         with torch.no_grad():
-            motions, boxes = self.motions(), self.boxes()
+            motions = self.motions()
+            boxes = self.boxes(motions)
             for k, kind in enumerate(kinds, start=1):
                 screw, q = screw_at(motions[k], kind, boxes.T_world_box.xyz[k])
                 rows[k, :3] = screw.axis.to(rows) * q
                 if kind == "revolute":
                     rows[k, 3:] = screw.origin.to(rows)
             self.leaves["motions"].copy_(rows)
-        self.kinds = tuple(kinds)
+            self.kinds = tuple(kinds)
+            self.set_boxes(boxes)
 
 
 def part_index(counts: tuple[int, ...], device: torch.device) -> Int[Tensor, " N"]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..geometry import Camera
 from ..model import Splats
-from .records import Projection, Render
+from .records import DILATION, Projection, Render
 from .render import blend, project
 
 TILE = 16  # pixels; patches are cut along the back ends' own tiles, in which they draw the same as in the whole image
@@ -48,12 +48,13 @@ class Backdrop:
     Args:
         splats: in the world; they get no gradient.
         camera: where from.
+        dilation: of these splats and the others; see `render`.
     """
 
-    def __init__(self, splats: Splats, camera: Camera):
-        self.camera = camera
+    def __init__(self, splats: Splats, camera: Camera, dilation: float = DILATION):
+        self.camera, self.dilation = camera, dilation
         with torch.no_grad():
-            self.projection = project(splats, camera)
+            self.projection = project(splats, camera, dilation)
 
     def drawn(self, background: Float[Tensor, " 3"]) -> Render:
         """The whole image, without others."""
@@ -65,7 +66,7 @@ class Backdrop:
         Args:
             splats: in the world; differentiable.
         """
-        others = project(splats, self.camera)
+        others = project(splats, self.camera, self.dilation)
         rows, columns = _reached(others, self.camera)
         low = others.xy.new_tensor([columns.start, rows.start])
         high = others.xy.new_tensor([columns.stop, rows.stop])

@@ -17,15 +17,15 @@ from . import project_kernels as pk
 from .records import LEAST_DISTANCE, STEEPEST, Projection, Render, frustum_limits, splat_rgb
 
 
-def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"]) -> Render:
+def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"], dilation: float) -> Render:
     """See `structuregs.raster.render`; computes in float32, and gives no gradient to the camera's pose."""
-    return blend(project(splats, camera), camera.width, camera.height, background)
+    return blend(project(splats, camera, dilation), camera.width, camera.height, background)
 
 
-def project(splats: Splats, camera: Camera) -> Projection:
+def project(splats: Splats, camera: Camera, dilation: float) -> Projection:
     """See `reference.project`."""
     T_camera_world = camera.T_world_camera.inverse()
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *frustum_limits(camera)], np.float32)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *frustum_limits(camera), dilation], np.float32)
     view = (_array(T_camera_world.rotation), _array(T_camera_world.xyz), lens, np.array([camera.width, camera.height]))
     xy, conic, depth, extent, opacity = _Project.apply(
         splats.means, splats.quats, splats.log_scales, splats.logit_opacities, view

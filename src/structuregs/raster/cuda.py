@@ -6,7 +6,7 @@ from torch import Tensor
 
 from ..geometry import Camera
 from ..model import Splats
-from .records import DILATION, NEAR, Projection, Render, splat_rgb
+from .records import NEAR, Projection, Render, splat_rgb
 from .reference import tangent_planes
 
 __all__ = ["blend", "project", "render", "tangent_planes"]
@@ -38,7 +38,7 @@ def _gsplat():
     return gsplat
 
 
-def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"]) -> Render:
+def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"], dilation: float) -> Render:
     """See `structuregs.raster.render`; gives no gradient to the camera's pose.
 
     gsplat leaves out the splat that would bring a pixel's transmittance below 1e-4, where the other back ends draw it as
@@ -46,15 +46,15 @@ def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"]) -
     """
     _gsplat()
     splats = Splats(**{name: value.to("cuda", torch.float32) for name, value in splats.tensors().items()})
-    return blend(project(splats, camera), camera.width, camera.height, background.to(splats.means))
+    return blend(project(splats, camera, dilation), camera.width, camera.height, background.to(splats.means))
 
 
-def project(splats: Splats, camera: Camera) -> Projection:
+def project(splats: Splats, camera: Camera, dilation: float) -> Projection:
     """See `reference.project`."""
     viewmat = camera.T_world_camera.inverse().as_matrix().detach().to(splats.means)[None]
     radii, means2d, depths, conics, _ = _gsplat().fully_fused_projection(
         splats.means, None, splats.quats, splats.scales, viewmat, camera.K.to(splats.means)[None], camera.width,
-        camera.height, eps2d=DILATION, near_plane=NEAR, opacities=splats.opacities,
+        camera.height, eps2d=dilation, near_plane=NEAR, opacities=splats.opacities,
     )  # fmt: skip
     extent = radii[0].to(torch.float32)
     return Projection(means2d[0], conics[0], depths[0], extent, splat_rgb(splats, camera), splats.opacities)

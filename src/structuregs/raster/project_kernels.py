@@ -11,9 +11,9 @@ import numpy as np
 from numba import prange
 
 from ..jit import kernel
-from .records import DILATION, MIN_ALPHA, NEAR
+from .records import MIN_ALPHA, NEAR
 
-_NEAR, _DILATION, _MIN_ALPHA = np.float32(NEAR), np.float32(DILATION), np.float32(MIN_ALPHA)
+_NEAR, _MIN_ALPHA = np.float32(NEAR), np.float32(MIN_ALPHA)
 _HUGE = np.float32(1e15)  # larger values, infinity and NaN are not drawn
 _ONE, _TWO, _HALF = np.float32(1), np.float32(2), np.float32(0.5)
 
@@ -87,12 +87,12 @@ def _image_row(f, a, u, az):
 
 
 @kernel()
-def _covariance(m_x, m_y):
+def _covariance(m_x, m_y, dilation):
     """(xx, xy, yy, determinant) of the dilated 2D covariance; the determinant as a sum of squares, which cannot cancel."""
     xx, xy, yy = dot(m_x, m_x), dot(m_x, m_y), dot(m_y, m_y)
     normal = _cross(m_x, m_y)
-    det = dot(normal, normal) + _DILATION * (xx + yy) + _DILATION * _DILATION
-    return xx + _DILATION, xy, yy + _DILATION, det
+    det = dot(normal, normal) + dilation * (xx + yy) + dilation * dilation
+    return xx + dilation, xy, yy + dilation, det
 
 
 @kernel()
@@ -108,7 +108,7 @@ def _scales(log_scales, i):
 def project_forward(means, quats, log_scales, logits, W, t, lens, size, xy, conic, depth, extent, opacity):
     """Fills the arrays xy (N 2), conic (N 3), depth (N), extent (N 2) and opacity (N) of a `Projection`.
 
-    W (3 3), t (3): world to camera. lens (8): fx, fy, cx, cy and the limits of u and v. size (2): width, height.
+    W (3 3), t (3): world to camera. lens (9): fx, fy, cx, cy, the limits of u and v, and the dilation. size (2): width, height.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     for i in prange(len(means)):
@@ -124,7 +124,7 @@ def project_forward(means, quats, log_scales, logits, W, t, lens, size, xy, coni
         w_, x_, y_, z_, _ = unit_quat(quats, i)
         a_x, a_y, a_z = _axes(W, rotation(w_, x_, y_, z_), _scales(log_scales, i))
         u, v = min(max(x / z, lens[4]), lens[5]), min(max(y / z, lens[6]), lens[7])
-        xx, cross, yy, det = _covariance(_image_row(fx / z, a_x, u, a_z), _image_row(fy / z, a_y, v, a_z))
+        xx, cross, yy, det = _covariance(_image_row(fx / z, a_x, u, a_z), _image_row(fy / z, a_y, v, a_z), lens[8])
         px, py = fx * x / z + cx, fy * y / z + cy
         if not (abs(px) < _HUGE and abs(py) < _HUGE and xx < _HUGE and yy < _HUGE and det < _HUGE * _HUGE):
             continue
@@ -162,15 +162,15 @@ def _mix(a, x, b, y, c, z):
 
 
 @kernel()
-def _row_gradients(m_x, m_y, g_xx, g_xy, g_yy):
+def _row_gradients(m_x, m_y, dilation, g_xx, g_xy, g_yy):
     """Gradients of the image rows from that of the conic (yy, -xy, xx) / det.
 
     By way of the determinant as a sum of squares: -K G K for the inverse K cancels for thin ellipses.
     """
-    xx, cross, yy, det = _covariance(m_x, m_y)
+    xx, cross, yy, det = _covariance(m_x, m_y, dilation)
     g_det = -(g_xx * yy - g_xy * cross + g_yy * xx) / (det * det)
     normal = _cross(m_x, m_y)
-    share, both, turn = _TWO * _DILATION * g_det, -g_xy / det, _TWO * g_det
+    share, both, turn = _TWO * dilation * g_det, -g_xy / det, _TWO * g_det
     g_mx = _mix(_TWO * g_yy / det + share, m_x, both, m_y, turn, _cross(m_y, normal))
     g_my = _mix(_TWO * g_xx / det + share, m_y, both, m_x, turn, _cross(normal, m_x))
     return g_mx, g_my
@@ -234,7 +234,7 @@ def project_backward(
         u, v = min(max(p[0] / p[2], lens[4]), lens[5]), min(max(p[1] / p[2], lens[6]), lens[7])
         f_x, f_y = lens[0] / p[2], lens[1] / p[2]
         m_x, m_y = _image_row(f_x, a_x, u, a_z), _image_row(f_y, a_y, v, a_z)
-        g_mx, g_my = _row_gradients(m_x, m_y, g_conic[i, 0], g_conic[i, 1], g_conic[i, 2])
+        g_mx, g_my = _row_gradients(m_x, m_y, lens[8], g_conic[i, 0], g_conic[i, 1], g_conic[i, 2])
 
         d = _centre_gradient(p, lens, m_x, m_y, a_z, g_mx, g_my, g_xy[i, 0], g_xy[i, 1], g_depth[i])
         d_means[i, 0], d_means[i, 1], d_means[i, 2] = world_column(W, d[0], d[1], d[2])

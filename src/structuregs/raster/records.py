@@ -12,7 +12,7 @@ from ..model import SH_C0, Splats
 from ..model.sh import sh_basis
 
 NEAR = 0.01  # nearer splats are not drawn; the capture's unit
-DILATION = 0.3  # px^2 on the diagonal of every 2D covariance: a splat is never thinner than about a pixel
+DILATION = 1 / 12  # px^2 on the diagonal of every 2D covariance: the variance of a pixel's square (3DGS: .3, which blurs edges)
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1 / 255  # fainter contributions are skipped
 MIN_TRANSMITTANCE = 1e-4  # a pixel takes no more splats once it lets less than this through

@@ -7,7 +7,6 @@ from torch import Tensor
 from ..geometry import Camera, quat_to_matrix
 from ..model import Splats
 from .records import (
-    DILATION,
     LEAST_DISTANCE,
     MAX_ALPHA,
     MIN_ALPHA,
@@ -21,12 +20,12 @@ from .records import (
 )
 
 
-def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"]) -> Render:
+def render(splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"], dilation: float) -> Render:
     """See `structuregs.raster.render`; time and memory grow with pixels times splats."""
-    return blend(project(splats, camera), camera.width, camera.height, background.to(splats.means))
+    return blend(project(splats, camera, dilation), camera.width, camera.height, background.to(splats.means))
 
 
-def project(splats: Splats, camera: Camera) -> Projection:
+def project(splats: Splats, camera: Camera, dilation: float) -> Projection:
     """Splats in the world to 2D Gaussians (Zwicker et al. 2001): Sigma' = J R S S R^T J^T + dilation."""
     T_camera_world = camera.T_world_camera.to(splats.means.device, splats.means.dtype).inverse()
     p = T_camera_world.apply(splats.means)
@@ -41,8 +40,8 @@ def project(splats: Splats, camera: Camera) -> Projection:
     row_y = camera.fy / z[:, None] * (axes[:, 1] - v[:, None] * axes[:, 2])
     xx, xy_, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     # The determinant as a sum of squares (Cauchy-Binet): it stays positive where xx * yy - xy * xy cancels.
-    det = torch.linalg.cross(row_x, row_y).square().sum(-1) + DILATION * (xx + yy) + DILATION**2
-    xx, yy = xx + DILATION, yy + DILATION
+    det = torch.linalg.cross(row_x, row_y).square().sum(-1) + dilation * (xx + yy) + dilation**2
+    xx, yy = xx + dilation, yy + dilation
     conic = torch.stack([yy, -xy_, xx], -1) / det[:, None]
 
     extent = _extent(xy, torch.stack([xx, yy], -1), splats.opacities, camera) * front[:, None]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..geometry import Camera
 from ..model import SH_C0, Splats
-from .records import Projection, Render
+from .records import DILATION, Projection, Render
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
 
@@ -20,7 +20,12 @@ def _module(name: str):
 
 
 def render(
-    splats: Splats, camera: Camera, *, background: Float[Tensor, " 3"] | None = None, backend: Backend = "auto"
+    splats: Splats,
+    camera: Camera,
+    *,
+    background: Float[Tensor, " 3"] | None = None,
+    dilation: float = DILATION,
+    backend: Backend = "auto",
 ) -> Render:
     """Draws splats, which are in the world, as the camera sees them; differentiable in the splats and the background.
 
@@ -28,6 +33,7 @@ def render(
         splats: in the world's frame.
         camera: where from, and the size of the image.
         background: rgb behind everything; white by default.
+        dilation: variance by which every splat is widened on the image, px^2.
         backend: "reference" is plain torch (any device and type, slow, differentiable in the camera's pose too), "cpu"
             is Numba (float32), "cuda" is gsplat; "auto" takes the fast one of the splats' device.
 
@@ -38,16 +44,16 @@ def render(
         background = splats.means.new_ones(3)
     if backend == "auto":
         backend = "cuda" if splats.means.is_cuda else "cpu"
-    return _module(backend).render(splats, camera, background=background)
+    return _module(backend).render(splats, camera, background=background, dilation=dilation)
 
 
 @torch.no_grad()
-def coverage_of(splats: Splats, chosen: Bool[Tensor, " N"], camera: Camera) -> Float[Tensor, "H W"]:
+def coverage_of(splats: Splats, chosen: Bool[Tensor, " N"], camera: Camera, dilation: float = DILATION) -> Float[Tensor, "H W"]:
     """The share of each pixel that some of the splats paint, where the others may stand before them."""
     sh = torch.zeros(len(splats), 1, 3, device=splats.means.device)
     sh[:, 0] = torch.where(chosen, 0.5, -0.5)[:, None] / SH_C0
     black = splats.means.new_zeros(3)
-    return render(replace(splats, sh=sh), camera, background=black).rgb[..., 0]
+    return render(replace(splats, sh=sh), camera, background=black, dilation=dilation).rgb[..., 0]
 
 
 def painted(splats: Splats, camera: Camera) -> Float[Tensor, " N"]:
@@ -67,9 +73,9 @@ def stages(tensor: Tensor):
     return _module(fast if fast in ("cpu", "cuda") else "reference")
 
 
-def project(splats: Splats, camera: Camera) -> Projection:
+def project(splats: Splats, camera: Camera, dilation: float = DILATION) -> Projection:
     """The first stage of `render`: splats in the world to 2D Gaussians on the image."""
-    return stages(splats.means).project(splats, camera)
+    return stages(splats.means).project(splats, camera, dilation)
 
 
 def blend(projection: Projection, width: int, height: int, background: Float[Tensor, " 3"]) -> Render:

@@ -11,7 +11,7 @@ from ..jit import lanes
 from ..model import Splats
 from . import blend_kernels as bk
 from .cpu import project
-from .records import Projection
+from .records import DILATION, Projection
 from .surface_kernels import surface_forward
 
 _BLUR = 0.01  # px^2: a splat seen edge-on has no plane that could be told
@@ -31,7 +31,7 @@ class Surface:
 
 
 @torch.no_grad()
-def render_surface(splats: Splats, camera: Camera) -> Surface:
+def render_surface(splats: Splats, camera: Camera, dilation: float = DILATION) -> Surface:
     """The depth of splats' surface, on the CPU, in float32 and without gradients.
 
     The expected depth of `render` lies behind the surface wherever light seeps through its first splats, and between two
@@ -40,7 +40,7 @@ def render_surface(splats: Splats, camera: Camera) -> Surface:
     lost gradually along the ray, around the plane that fits its ellipsoid best (as in Gaussian opacity fields, Yu et al.
     2024): fat splats count from their near side.
     """
-    p = project(splats, camera)
+    p = project(splats, camera, dilation)
     xy, conic, opacity, rgb, z, extent = (
         t.float().contiguous().numpy() for t in (p.xy, p.conic, p.opacity, p.rgb, p.depth, p.extent)
     )
