@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from structuregs.boxes import Face, Overlap, Shown
+from structuregs.boxes.appearance import LOOK_DILATION
 from structuregs.capture import Capture, ImageStack, View
 from structuregs.fit.evidence import alike_in_both
 from structuregs.geometry import SE3, Box, Camera
@@ -52,7 +53,7 @@ def shown(splats: Splats, gain: float = 1.0, lift: float = 0.0) -> Shown:
     """A state's photos of the splats, all of which are the part's, the photos in another light."""
     rgb, alpha = [], []
     for camera in cameras():
-        picture = render(splats, camera)
+        picture = render(splats, camera, dilation=LOOK_DILATION)
         rgb.append(((picture.rgb * gain + lift).clamp(0, 1) * 255).round().byte().numpy())
         alpha.append((picture.alpha * 255).round().byte().numpy())
     return Shown(ImageStack(cameras(), np.stack(rgb), np.stack(alpha)), splats, torch.ones(len(splats), dtype=torch.bool))
@@ -181,7 +182,7 @@ def test_a_part_whose_photos_are_not_alike_asks_for_a_look():
     true = with_a_base(slide(0.0))
     rows = []
     for state in (0, 1):
-        pictures = [render(true.parts.at_state(state), camera) for camera in cameras()]
+        pictures = [render(true.parts.at_state(state), camera, dilation=LOOK_DILATION) for camera in cameras()]
         rgba = [torch.cat([p.rgb, p.alpha[..., None]], -1).clamp(0, 1).mul(255).round().byte().numpy() for p in pictures]
         rows.append(tuple(View(f"{i}", camera, image) for i, (camera, image) in enumerate(zip(cameras(), rgba, strict=True))))
     capture = Capture("board", Path("board"), (rows[0], rows[1]), (rows[0], rows[1]), "memory")

@@ -23,7 +23,7 @@ from structuregs.boxes import (
     strewn,
     survey,
 )
-from structuregs.boxes.appearance import AppearanceConfig
+from structuregs.boxes.appearance import LOOK_DILATION, AppearanceConfig
 from structuregs.boxes.divide import AROUND, FACTORS, cut_across, divide, moving_along
 from structuregs.boxes.hypotheses import (
     Hypothesis,
@@ -399,7 +399,7 @@ class TestCue:
         obj, looks = looks_of("cabinet")
         for cluster in clusters(looks, SMALL.search.cue):
             shares = [share_of_part(cluster.points, obj, k, cluster.state, 1.5 * looks[0].hull.voxel) for k in (1, 2)]
-            assert max(shares) > 0.8
+            assert sum(shares) > 0.75  # they touch: a cluster may hold a corner of the other
 
     def test_what_stands_still_shows_nothing(self):
         assert clusters(looks_of("static")[1], SMALL.search.cue) == []
@@ -481,7 +481,8 @@ class TestParts:
         look = looks_of("laptop")[1][0]
         cut = int(share * len(look.splats))
         scene = Scene(look, look.splats[cut:], np.arange(3), KDTree(look.points))
-        alphas = [float(render(look.splats, look.stack.cameras[v]).alpha.mean()) for v in range(3)]
+        cameras = look.stack.cameras[:3]
+        alphas = [float(render(look.splats, camera, dilation=LOOK_DILATION).alpha.mean()) for camera in cameras]
         assert scene.footprint(look.splats[:cut]) == pytest.approx(share * float(np.mean(alphas)), abs=1e-5)
 
     def test_what_no_motion_explains_is_left_over_and_told(self):

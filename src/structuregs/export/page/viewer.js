@@ -1,8 +1,9 @@
 "use strict";
 // Draws a scene of splats, boxes and joint axes with WebGL2. The maths is that of structuregs.raster: cameras with OpenCV's
-// axes (x right, y down, z forward), pixel centres at +0.5, 2D covariances widened by 0.3 px^2, colours over white.
+// axes (x right, y down, z forward), pixel centres at +0.5, 2D covariances widened by a pixel's variance, colours over white.
 
 const NEAR = 0.01;
+const DILATION = 1 / 12; // px^2, as the renderer's
 const COLUMNS = 16; // 16-bit numbers of a splat: mean 3, rotation 3, log scale 3, rgb 3, opacity 1, tint 3
 const TEXELS = COLUMNS / 4;
 const SPLATS_PER_ROW = 512; // 4 texels each: rows of 2048 texels, which every WebGL2 device allows
@@ -68,8 +69,8 @@ void main() {
   vec3 m_x = lens.x / p.z * (rows[0] - uv.x * rows[2]), m_y = lens.y / p.z * (rows[1] - uv.y * rows[2]);
   float xx = dot(m_x, m_x), xy = dot(m_x, m_y), yy = dot(m_y, m_y);
   vec3 across = cross(m_x, m_y);
-  float determinant = dot(across, across) + 0.3 * (xx + yy) + 0.09;
-  float wide = 0.5 * (xx + yy) + 0.3 + length(vec2(0.5 * (xx - yy), xy));
+  float determinant = dot(across, across) + ${DILATION} * (xx + yy) + ${DILATION * DILATION};
+  float wide = 0.5 * (xx + yy) + ${DILATION} + length(vec2(0.5 * (xx - yy), xy));
   float angle = 0.5 * atan(2.0 * xy, xx == yy && xy == 0.0 ? 1.0 : xx - yy);
   vec2 axis = vec2(cos(angle), sin(angle));
 
