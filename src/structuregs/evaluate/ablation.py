@@ -14,7 +14,7 @@ def ablations(capture: Capture, config: FitConfig, folder: Path, seed: int) -> l
     rows = {
         "no_tint": ("no colour difference between the states", without_tint(config)),
         "given_lens": ("principal point as given", replace(config, rates=replace(config.rates, principal_point=0.0))),
-        "light_masks": ("masks of half the weight", replace(config, alpha_weight=config.alpha_weight / 2)),
+        "heavy_masks": ("masks of four times the weight", replace(config, alpha_weight=4 * config.alpha_weight)),
         "one_state": ("motions move state 1 alone", replace(config, give_way=0.0)),
         "free_joints": ("motions not held to one degree of freedom", replace(config, one_joint_from=1.0)),
         "free_axes": ("joints not drawn to the base's axes", replace(config, along_base=0.0)),

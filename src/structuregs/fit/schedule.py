@@ -100,8 +100,9 @@ class FitConfig:
     ssim_weights: tuple[tuple[float, float], ...] = ((0.0, 0.05), (0.65, 0.2))
     """(part of the fit, share) from which on D-SSIM has that share of the image loss.  While texture is finer than the splats
     it throws turns off; afterwards surfaces come out better with 3DGS's .2 than with less."""
-    alpha_weight: float = 2.0
-    """Of the mask's error beside the colour's: outlines are what holds a motion, and masks show them sharpest."""
+    alpha_weight: float = 0.5
+    """Of the mask's error beside the colour's.  More brings turns nearer, and costs surfaces more: a mask asks for more opacity
+    wherever its object is."""
     tint_penalty: float = 0.3
     """Of the mean absolute colour difference between the states."""
     opacity_penalty: float = 0.2
