@@ -323,7 +323,7 @@ class TestLastStep:
         base = DOOR_AND_DRAWER.part_splats(0)
         rows = base[torch.zeros(650, dtype=torch.long)]
         splats = replace(rows, means=torch.cat([floor, hidden]), logit_opacities=torch.full((650,), 6.0))
-        splats = replace(splats, log_scales=torch.full((650, 3), math.log(0.04)))
+        splats = replace(splats, log_scales=torch.full((650, 3), math.log(0.06)))
         parts = replace(
             DOOR_AND_DRAWER,
             splats=Splats.concatenate([splats, DOOR_AND_DRAWER.splats[torch.arange(120, 360)]]),
