@@ -49,7 +49,7 @@ def render(
 
 @torch.no_grad()
 def coverage_of(splats: Splats, chosen: Bool[Tensor, " N"], camera: Camera, dilation: float = DILATION) -> Float[Tensor, "H W"]:
-    """The share of each pixel that some of the splats paint, where the others may stand before them."""
+    """The share of each pixel that some of the splats paint, where the others may stand before them; else as `render`."""
     sh = torch.zeros(len(splats), 1, 3, device=splats.means.device)
     sh[:, 0] = torch.where(chosen, 0.5, -0.5)[:, None] / SH_C0
     black = splats.means.new_zeros(3)

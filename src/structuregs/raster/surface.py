@@ -38,7 +38,7 @@ def render_surface(splats: Splats, camera: Camera, dilation: float = DILATION) -
     surfaces at edges; a quantile lies on one of them.  The median gives way to what hangs in the air before a surface a
     little more often than the depth where two fifths are left; with less light, thin boards are missed.  A splat's light is
     lost gradually along the ray, around the plane that fits its ellipsoid best (as in Gaussian opacity fields, Yu et al.
-    2024): fat splats count from their near side.
+    2024): fat splats count from their near side.  On the image splats are widened as `render` does.
     """
     p = project(splats, camera, dilation)
     xy, conic, opacity, rgb, z, extent = (
