@@ -320,6 +320,23 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
     return hypothesis
 
 
+def along_base(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypothesis:
+    """The hypothesis; a slide goes along the nearest axis of the base, whatever that costs.
+
+    For what does not show in the other state: photos know nothing of its way, only of what happens to lie there.
+
+    Args:
+        hypothesis: a judged motion.
+        trial: the part between the photos.
+        base: the base's box.
+    """
+    if kind_of(hypothesis.motion) != "prismatic":
+        return hypothesis
+    own, q = screw_at(hypothesis.motion, "prismatic", trial.box.T_world_box.xyz)
+    straight = _straight(own, base)
+    return trial.judge(trial.moved(hypothesis, straight.motion(q * float(straight.axis @ own.axis))))
+
+
 def measured(hypothesis: Hypothesis, trial: Trial) -> Hypothesis:
     """The hypothesis, turned or slid a little more or less along its own axis as the photos see it, within a tenth.
 

@@ -22,11 +22,12 @@ from .hypotheses import (
     oddity,
     stack_motions,
 )
-from .judge import NOISE, Scene, Trial, measured
+from .judge import NOISE, Scene, Trial, just_out_of_sight, measured
 from .pieces import MovingPart, Pieces
 from .review import PartReview
 
 _TORN = 0.8  # of what a cluster explained as one part: several that explain less together are that part, torn to pieces
+_CLAIM = 0.1  # of a cluster's points: so much of it moves along with a part found before, or it is tried as it is
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class PartSearch:
 
     def __init__(self, looks: tuple[StateLook, StateLook], config: SearchConfig, seed: int):
         self.pieces = Pieces(looks, config, seed)
+        self.review = PartReview(self.pieces)
         self.config = config
         self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
 
@@ -104,14 +106,39 @@ class PartSearch:
         together = config.cut if shows else config.cut_shut
         return cut_across(part.points, box, places, support, screw, pieces.voxel, together)
 
-    def _replaced(self, index: int, points: list[Points]) -> list[int]:
-        """Indices of new clusters in place of one; these do not move together."""
-        state, before = self.pieces.clusters[index].state, len(self.pieces)
+    def _taken(self, state: int, points: list[Points]) -> list[int]:
+        """Indices of new clusters."""
+        before = len(self.pieces)
         for some in sorted(points, key=len, reverse=True):
             self.pieces.take(Cluster(state, some))
-        new = range(before, len(self.pieces))
+        return list(range(before, len(self.pieces)))
+
+    def _replaced(self, index: int, points: list[Points]) -> list[int]:
+        """Indices of new clusters in place of one; these do not move together."""
+        new = self._taken(self.pieces.clusters[index].state, points)
         self.pieces.apart |= dict.fromkeys(new, self.pieces.apart.get(index, index))
-        return list(new)
+        return new
+
+    def _claimed(self, part: MovingPart, found: dict[int, Found]) -> MovingPart | None:
+        """What is left of a part, perhaps nothing, when those found before have taken what moves along with them of it.
+
+        None, and nothing is taken, if that is little.
+        """
+        left, takers = part, dict(found)
+        asked = [k for k, one in found.items() if one.part.state == part.state]
+        while asked and left.pieces:
+            index = asked.pop(0)
+            if not self.review.touch(takers[index].part, left):
+                continue
+            others = [one.part for k, one in takers.items() if k != index]
+            taker, rest = self.review.with_claims(takers[index].part, left, others)
+            if rest is not left:
+                takers[index], left = replace(takers[index], part=taker), rest
+                asked.insert(0, index)
+        if sum(map(len, left.pieces)) > (1 - _CLAIM) * len(part.points):
+            return None
+        found.update(takers)
+        return left
 
     def _left_of(self, index: int, parts: list[MovingPart]) -> list[int]:
         """What is left to explain of a cluster, by indices: itself, if no part lies there, or new clusters in its place."""
@@ -136,7 +163,7 @@ class PartSearch:
     def steps(self) -> Generator[int, None, list[MovingPart]]:
         """The search, bit by bit: yields how many clusters are done with, and returns the parts, the best first."""
         found = yield from self._found()
-        return sorted(PartReview(self.pieces).reviewed(found), key=lambda part: -part.weight)
+        return sorted(self.review.reviewed(found), key=lambda part: -part.weight)
 
     def _found(self) -> Generator[int, None, list[MovingPart]]:
         """The parts as they are found, one after the other."""
@@ -159,9 +186,14 @@ class PartSearch:
             if index in explained:
                 continue
             part, members, trial = self._try(index, parts, explained)
+            unclear = trial.explained(part.hypothesis) < self.config.clear_case * trial.most
+            if unclear and (left := self._claimed(part, found)) is not None:
+                explained |= members
+                todo = self._taken(part.state, [left.points] if left.pieces else []) + todo
+                continue
             one = Found(part, -trial.cost(part.hypothesis))
             several = self._divided(part, trial, index in self.pieces.apart) if part.gain > NOISE else [part.points]
-            doubtful = len(several) > 1 or trial.explained(part.hypothesis) < self.config.clear_case * trial.most
+            doubtful = unclear or len(several) > 1
             if doubtful and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
                 waiting.add(index)
                 waited.add(index)
@@ -178,7 +210,8 @@ class PartSearch:
                 continue
             share = len(part.points) / len(self.pieces.looks[part.state].points)
             large = share > self.config.large
-            if part.gain < (-self.config.harm if large else NOISE):
+            harm = (part.hypothesis.image_error - trial.there.absent) / trial.absent
+            if part.gain < NOISE and not (large and min(harm, -part.gain) < self.config.harm):
                 if large:
                     refused[index] = (part.state, share)
                 continue
@@ -250,6 +283,9 @@ class PartSearch:
             refined.append((pulled, group, trial.cost(pulled)))
         near = self.from_rest(index, alone, done)
         refined.append((near, frozenset(), alone.cost(near)))
+        best = min(refined, key=lambda row: row[2])[0]
+        if (unseen := just_out_of_sight(best, alone, pieces.base_box)) is not best:
+            refined.append((unseen, frozenset(), alone.cost(unseen)))
         refined.sort(key=lambda row: row[2])
         chosen = distinct(stack_motions([h.motion for h, _, _ in refined]), box, 0.1, len(refined))
         best, group, _ = refined[0]

@@ -14,7 +14,7 @@ from ..model import Splats
 from .config import SearchConfig
 from .cue import Cluster, Points, StateLook, base_axes, box_around, clusters
 from .hypotheses import Hypothesis
-from .judge import Scene, Trial, refine, simplest
+from .judge import Scene, Trial, along_base, refine, simplest
 
 
 @dataclass(frozen=True)
@@ -187,8 +187,10 @@ class Pieces:
             steps: of the pull.
         """
         refined = refine(start, trial, steps, self.config.rate)
-        share = self.config.plain if trial.shows(refined) else self.config.plain_if_shut
-        return min(simplest(refined, trial, self.base_box, share), start, key=trial.cost)
+        if trial.shows(refined):
+            return min(simplest(refined, trial, self.base_box, self.config.plain), start, key=trial.cost)
+        refined = simplest(refined, trial, self.base_box, self.config.plain_if_shut)
+        return min((along_base(h, trial, self.base_box) for h in (refined, start)), key=trial.cost)
 
     def sample(self, points: Float64[np.ndarray, "P 3"], most: int) -> Float64[np.ndarray, "Q 3"]:
         """At most so many of the points, drawn by chance."""

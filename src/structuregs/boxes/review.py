@@ -52,19 +52,25 @@ class PartReview:
         parts = sorted(parts, key=lambda part: -part.weight)
         for taker in range(len(parts)):
             asked = {k for k, part in enumerate(parts) if k == taker or part.state != parts[taker].state}
-            while beside := [k for k in range(len(parts)) if k not in asked and self._touch(parts[taker], parts[k])]:
+            while beside := [k for k in range(len(parts)) if k not in asked and self.touch(parts[taker], parts[k])]:
                 giver = beside[0]
                 asked.add(giver)
                 others = [part for k, part in enumerate(parts) if k not in (taker, giver) and part.pieces]
-                parts[taker], parts[giver] = self._with_claims(parts[taker], parts[giver], others)
+                parts[taker], parts[giver] = self.with_claims(parts[taker], parts[giver], others)
         return [part for part in parts if part.pieces]
 
-    def _with_claims(self, taker: MovingPart, giver: MovingPart, others: list[MovingPart]) -> tuple[MovingPart, MovingPart]:
-        """Two parts after the one has taken what moves along with it of the other, which may be all of it."""
+    def with_claims(self, taker: MovingPart, giver: MovingPart, others: list[MovingPart]) -> tuple[MovingPart, MovingPart]:
+        """Two parts after the one has taken what moves along with it of the other, which may be all of it.
+
+        Args:
+            taker: which motion is asked for.
+            giver: of the same state.
+            others: other parts in their places.
+        """
         pieces, state = self.pieces, taker.state
         held, mine = pieces.held_by_part(giver), pieces.looks[state].splats
         splats = mine[held]
-        if not len(splats):  # crumbs that no photo asks for
+        if not len(splats) or not self._shows(taker, others):  # crumbs that no photo asks for
             return taker, giver
         screw, q = screw_at(taker.hypothesis.motion, kind_of(taker.hypothesis.motion), pieces.box(taker.points).T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(AROUND, dtype=torch.float64)).wxyz_xyz
@@ -126,12 +132,19 @@ class PartReview:
             parts = [whole, *(part for part in parts if all(part is not one for one in pair))]
 
     def _as_one(self, one: MovingPart, two: MovingPart, rest: list[MovingPart]) -> tuple[float, MovingPart]:
-        """What speaks against two parts of one state being one, in mean error (below 0: nothing), and the two as one."""
+        """What speaks against two parts of one state being one, in mean error (below 0: nothing), and the two as one.
+
+        The lesser has to show in the other state, moved like the whole, or to continue the greater: wherever it goes unseen,
+        as a tray does behind a door, it would do no harm.
+        """
         follower, leader = sorted((one, two), key=lambda part: part.weight)
         (whole,) = self._merged(leader, follower, [])
         trial, box = self._again(whole, rest), self.pieces.box
         ways = [trial.judge(h) for h in (leader.hypothesis, trial.moved(leader.hypothesis, follower.hypothesis.motion))]
         best = min(ways, key=lambda h: h.error)
+        alone = trial.there.error(self.pieces.splats_of(leader), best.motion)
+        if alone - best.image_error < self.config.shows * follower.weight and not self._continues(follower, leader):
+            return float("inf"), whole
         apart = trial.apart((self.pieces.splats_of(p), box(p.points), p.hypothesis.motion) for p in (leader, follower))
         gap = displacements(stack_motions([leader.hypothesis.motion]), follower.hypothesis.motion, box(follower.points))[0]
         allowed = self.config.alike * follower.weight if gap < self.config.same else 0.0
@@ -152,16 +165,17 @@ class PartReview:
             by_cost = sorted(again, key=trial.cost)
             gaps = displacements(stack_motions(shared), by_cost[0].motion, trial.box)
             losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
-            beside = np.array([self._touch(part, other) for other in others])
+            beside = np.array([self.touch(part, other) for other in others])
             touching = np.array([self._continues(part, other) for other in others])
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
             # What does not show in the other state says little of how it moves, but two pieces do not agree by chance.
             agree = gaps < self.config.same / np.where(beside, 2, 8)
-            alike &= trial.shows(starts[0]) | touching | agree
+            lesser = np.array([other.weight >= part.weight for other in others])
+            alike &= (trial.shows(starts[0]) & lesser) | touching | agree
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
             best_of_its_own = min(h.error + trial.gone_in(h) + h.against(part.weight) for h in again[: -len(shared)])
             needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
-            alike |= needless & touching & np.array([other.weight > part.weight for other in others])
+            alike |= needless & touching & lesser
 
             twin = int(np.argmin(np.where(alike, losses, np.inf)))
             if alike[twin]:
@@ -174,15 +188,20 @@ class PartReview:
             index += 1
         return parts
 
+    def _shows(self, part: MovingPart, others: list[MovingPart]) -> bool:
+        """Whether the photos of the other state show a part, with others in place."""
+        trial = self._again(part, others)
+        return trial.shows(trial.judge(part.hypothesis))
+
     def _continues(self, part: MovingPart, other: MovingPart) -> bool:
         """Whether two parts touch where the one was found (the clustering's reach), and one box holds both about as well."""
-        if not self._touch(part, other):
+        if not self.touch(part, other):
             return False
         theirs = other.points_in(part.state)
         whole, *both = (float(self.pieces.box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
         return sum(both) > self.config.cue.hollow * whole
 
-    def _touch(self, one: MovingPart, other: MovingPart) -> bool:
+    def touch(self, one: MovingPart, other: MovingPart) -> bool:
         """Whether two parts touch where the one was found (the clustering's reach)."""
         return self._voxels_between(one, other) <= self.config.cue.link
 
