@@ -321,16 +321,17 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
 
 
 def along_base(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypothesis:
-    """The hypothesis; a slide goes along the nearest axis of the base, whatever that costs.
+    """The hypothesis; a slide, or a turn out of sight, becomes a slide along the nearest axis of the base, whatever that costs.
 
-    For what does not show in the other state: photos know nothing of its way, only of what happens to lie there.
+    For what does not show in the other state: photos know nothing of its way, only of what happens to lie there.  What has
+    gone in somewhere are drawers and trays; a door that is shut is seen (see `Trial.gone_in`).
 
     Args:
         hypothesis: a judged motion.
         trial: the part between the photos.
         base: the base's box.
     """
-    if kind_of(hypothesis.motion) != "prismatic":
+    if kind_of(hypothesis.motion) == "revolute" and not trial.out_of_sight(hypothesis.motion):
         return hypothesis
     own, q = screw_at(hypothesis.motion, "prismatic", trial.box.T_world_box.xyz)
     straight = _straight(own, base)

@@ -210,8 +210,9 @@ class PartSearch:
                 continue
             share = len(part.points) / len(self.pieces.looks[part.state].points)
             large = share > self.config.large
-            harm = (part.hypothesis.image_error - trial.there.absent) / trial.absent
-            if part.gain < NOISE and not (large and min(harm, -part.gain) < self.config.harm):
+            if part.gain < (-self.config.harm if large else NOISE) and not (
+                large and trial.out_of_sight(part.hypothesis.motion)
+            ):
                 if large:
                     refused[index] = (part.state, share)
                 continue
