@@ -69,4 +69,5 @@ class SearchConfig:
     large: float = 0.01
     """A part that holds this fraction of its state's points came from somewhere: it is kept if it does little harm..."""
     harm: float = 0.01
-    """...and adds less than this fraction to the photo error; what is shut may show in no photo."""
+    """...and adds less than this fraction to the photo error; what is shut may show in no photo, and out of sight it is
+    kept whatever it adds."""

@@ -122,7 +122,7 @@ class PartSearch:
     def _claimed(self, part: MovingPart, found: dict[int, Found]) -> MovingPart | None:
         """What is left of a part, perhaps nothing, when those found before have taken what moves along with them of it.
 
-        None, and nothing is taken, if that is little.
+        Those in `found` are replaced.  None, and nothing is taken, if that is little.
         """
         left, takers = part, dict(found)
         asked = [k for k, one in found.items() if one.part.state == part.state]

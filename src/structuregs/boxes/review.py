@@ -70,7 +70,7 @@ class PartReview:
         pieces, state = self.pieces, taker.state
         held, mine = pieces.held_by_part(giver), pieces.looks[state].splats
         splats = mine[held]
-        if not len(splats) or not self._shows(taker, others):  # crumbs that no photo asks for
+        if not len(splats) or not self._shows(taker, others):  # crumbs; or none can say what moves along
             return taker, giver
         screw, q = screw_at(taker.hypothesis.motion, kind_of(taker.hypothesis.motion), pieces.box(taker.points).T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(AROUND, dtype=torch.float64)).wxyz_xyz
