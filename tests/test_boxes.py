@@ -37,12 +37,12 @@ from structuregs.boxes.hypotheses import (
     stack_motions,
     turn_about,
 )
-from structuregs.boxes.judge import Scene, Trial, along_base, just_out_of_sight, refine, simplest
+from structuregs.boxes.judge import Scene, Trial, along_base, just_out_of_sight, refine, shortest_out_of_sight, simplest
 from structuregs.boxes.partition import Division, Found, undivided
 from structuregs.boxes.pieces import Pieces
 from structuregs.boxes.review import PartReview
 from structuregs.capture import Capture, ImageStack, TrueJoint
-from structuregs.geometry import SE3, Box, Camera, Screw
+from structuregs.geometry import SE3, Box, Camera, Screw, screw_at
 from structuregs.joints import kind_of
 from structuregs.model import SH_C0, Splats
 from structuregs.points import points_from
@@ -291,38 +291,64 @@ def trial_of_screen() -> Trial:
     there, here = (
         Scene(looks[s], looks[1 - s].splats[~inside[1 - s]], np.arange(0, 16, 2), KDTree(looks[s].points)) for s in (1, 0)
     )
-    splats, own = looks[0].splats[inside[0]], KDTree(points_of(screen, 100))
-    return Trial(there, here, looks[1].splats, splats, screen, 0.1, most=0.1, near=0.0, own=own, taken=None, least=0.01)
+    splats, own = looks[0].splats[inside[0]], KDTree(points_of(screen, 4000))
+    return Trial(there, here, looks[1].splats, splats, screen, 0.1, most=0.1, near=0.02, own=own, taken=None, least=0.01)
+
+
+def panels(box: Box, grey: float) -> Splats:
+    """The six faces of a box, opaque, of one colour."""
+    means = torch.from_numpy(points_of(box, 12000)).float()
+    sh = torch.full((len(means), 1, 3), (grey - 0.5) / SH_C0)
+    upright = torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
+    return Splats(means, upright, torch.full((len(means), 3), math.log(0.015)), torch.full((len(means),), 4.0), sh)
+
+
+def scene_of(shown: list[Splats], rest: Splats) -> Scene:
+    """Eight photos of what is shown, from z = -4 by x = 4 to z = 4, and the rest as it stands in them."""
+    rgb, alpha, cameras = [], [], []
+    for k in range(8):
+        turn = SE3.exp(torch.tensor([0, 0, 0, 0, -math.pi * (k + 0.5) / 8, 0]))
+        cameras.append(Camera(turn @ SE3.exp(torch.tensor([0, 0, -4.0, 0, 0, 0])), 100.0, 100.0, 32.0, 32.0, 64, 64))
+        picture = render(Splats.concatenate(shown), cameras[-1])
+        rgb.append((picture.rgb.clamp(0, 1) * 255).round().byte().numpy())
+        alpha.append((picture.alpha * 255).round().byte().numpy())
+    look = replace(looks_of("laptop")[1][0], stack=ImageStack(tuple(cameras), np.stack(rgb), np.stack(alpha)))
+    return Scene(look, rest, np.arange(8), KDTree(rest.means.numpy()))
 
 
 def cupboard_and_tray(pushed: float) -> Trial:
     """A tray before the front of a shut cupboard, .8 wide; photos of the other state see it pushed in so far, or, at 0, not."""
-
-    def panels(box: Box, grey: float) -> Splats:
-        means = torch.from_numpy(points_of(box, 12000)).float()
-        sh = torch.full((len(means), 1, 3), (grey - 0.5) / SH_C0)
-        upright = torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
-        return Splats(means, upright, torch.full((len(means), 3), math.log(0.015)), torch.full((len(means),), 4.0), sh)
-
     cupboard = panels(Box(NO_MOTION, torch.tensor([0.4, 0.4, 0.4], dtype=F64)), 0.7)
     box = Box(SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0.75, 0, 0], dtype=F64)), torch.tensor([0.15, 0.2, 0.1], dtype=F64))
     tray = panels(box, 0.2)
-    stacks = []
-    for moved in (-pushed if pushed else None, 0.0):
-        there = [] if moved is None else [tray.moved(SE3.from_quat(NO_MOTION.wxyz, torch.tensor([moved, 0, 0], dtype=F64)))]
-        rgb, alpha, cameras = [], [], []
-        for k in range(8):
-            turn = SE3.exp(torch.tensor([0, 0, 0, 0, -math.pi * (k + 0.5) / 8, 0]))  # from z = -4 by x = 4 to z = 4
-            cameras.append(Camera(turn @ SE3.exp(torch.tensor([0, 0, -4.0, 0, 0, 0])), 100.0, 100.0, 32.0, 32.0, 64, 64))
-            picture = render(Splats.concatenate([cupboard, *there]), cameras[-1])
-            rgb.append((picture.rgb.clamp(0, 1) * 255).round().byte().numpy())
-            alpha.append((picture.alpha * 255).round().byte().numpy())
-        stacks.append(ImageStack(tuple(cameras), np.stack(rgb), np.stack(alpha)))
-    look = looks_of("laptop")[1][0]
-    still = KDTree(cupboard.means.numpy())
-    there, here = (Scene(replace(look, stack=stack), cupboard, np.arange(8), still) for stack in stacks)
+    pushed_in = [tray.moved(SE3.from_quat(NO_MOTION.wxyz, torch.tensor([-pushed, 0, 0], dtype=F64)))] if pushed else []
+    there, here = scene_of([cupboard, *pushed_in], cupboard), scene_of([cupboard, tray], cupboard)
     own = KDTree(tray.means.numpy())
-    return Trial(there, here, cupboard, tray, box, weight=0.04, most=0.04, near=0.0, own=own, taken=None, least=0.002)
+    return Trial(there, here, cupboard, tray, box, weight=0.04, most=0.04, near=0.02, own=own, taken=None, least=0.002)
+
+
+def doors_above_each_other(lower: float, upper: float) -> tuple[Trial, Screw]:
+    """Two doors, .4 high, that touch, on one upright line at x = .4; shut in the other state and open by so many degrees here.
+
+    Returns:
+        Both as one part, and the line.
+    """
+    hinge = Screw("revolute", torch.tensor([0.0, 1, 0], dtype=F64), torch.tensor([0.4, 0, -0.4], dtype=F64))
+    beside = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0.45, 0, 0], dtype=F64))
+    post = panels(Box(beside, torch.full((3,), 0.05, dtype=F64)), 0.5)
+    shut, opened, points = [], [], []
+    for level, grey, degrees in ((-0.2, 0.2, lower), (0.2, 0.8, upper)):
+        at = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0, level, -0.4], dtype=F64))
+        box = Box(at, torch.tensor([0.4, 0.2, 0.02], dtype=F64))
+        shut.append(panels(box, grey))
+        opened.append(shut[-1].moved(hinge.motion(math.radians(degrees))))
+        points.append(opened[-1].means.double().numpy())
+    both, piece, others = np.concatenate(points), Splats.concatenate(opened), Splats.concatenate([post, *shut])
+    there, here = scene_of([post, *shut], post), scene_of([post, *opened], post)
+    weight = here.absent - here.error(piece, NO_MOTION)
+    own = KDTree(both)
+    trial = Trial(there, here, others, piece, box_around(both, 0.01), weight, weight, 0.02, own, taken=None, least=0.1 * weight)
+    return trial, hinge
 
 
 @dataclass(frozen=True)
@@ -545,6 +571,19 @@ class TestParts:
         turn = trial.judge(replace(start, motion=along_slide))
         assert along_base(turn, trial, base) is turn
 
+    def test_what_turns_into_the_way_slides(self):
+        trial = cupboard_and_tray(0.0)
+        rest = trial.box.T_world_box.xyz
+        aside = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([-0.3, 0.05, 0], dtype=F64))
+        askew = turn_about(aside.apply(rest), torch.tensor([0, 0, 0, 0, 0, 0.4], dtype=F64)) @ aside
+        start = trial.judge(Hypothesis(askew, 0.0, 0.0, 0.0))
+        assert kind_of(askew) == "revolute"
+        assert trial.in_the_way(start)
+        assert not trial.out_of_sight(askew)
+        straight = along_base(start, trial, Box(NO_MOTION, torch.tensor([0.4, 0.4, 0.4], dtype=F64)))
+        assert straight.motion.xyz.tolist() == pytest.approx([-0.3, 0.0, 0.0], abs=1e-9)
+        assert kind_of(straight.motion) == "prismatic"
+
     @pytest.mark.parametrize(
         ("pushed", "told"),
         [
@@ -564,6 +603,45 @@ class TestParts:
         else:  # the tray's front is .5 before the front of the cupboard
             assert 0.5 <= -float(found.motion.xyz[0]) < 0.56
             assert found.motion.xyz[1:].abs().max() < 1e-9
+
+    def test_the_shortest_way_out_of_sight_is_along_the_base_and_no_longer_than_it(self):
+        trial = cupboard_and_tray(0.0)
+        for size, found in ((0.4, True), (0.2, False)):  # the tray's front is .5 before the front of the cupboard
+            motion = shortest_out_of_sight(trial, Box(NO_MOTION, torch.full((3,), size, dtype=F64)))
+            assert (motion is not None) == found
+            if motion is not None:
+                assert 0.5 <= -float(motion.xyz[0]) < 0.56
+                assert motion.xyz[1:].abs().max() < 1e-9
+                assert trial.in_view(motion, replace(trial.there, rest=trial.there.rest[:0]))
+
+    def test_doors_above_each_other_that_look_like_one_askew_are_two(self):
+        """One motion for doors open by 30 and by 70 degrees leans; only along their hinge does each say how far it goes."""
+        trial, hinge = doors_above_each_other(30.0, 70.0)
+        search = PartSearch(looks_of("laptop")[1], SMALL.search, seed=0)
+        search.pieces.base_box = Box(NO_MOTION, torch.tensor([0.4, 0.4, 0.4], dtype=F64))
+        both = trial.judge(Hypothesis(hinge.motion(-math.radians(50.0)), 0.0, 0.0, 0.0))
+        leaning = refine(both, trial, 60, 0.03)
+        part = MovingPart(1, (trial.own.data,), leaning, 1.0, trial.weight)
+        screw, q = screw_at(leaning.motion, "revolute", trial.box.T_world_box.xyz)
+        assert math.degrees(math.acos(abs(float(screw.axis[1])))) > 3
+        assert len(search._divided_along(screw, q, part, trial, False)) == 1
+        several = search._divided(part, trial, False)
+        assert len(several) == 2
+        for points in several:
+            aside = points[np.abs(points[:, 1]) > 0.05, 1]  # off the faces with which they touch
+            assert abs(np.sign(aside).mean()) > 0.95
+
+    def test_what_is_seen_through_a_frame_is_not_brought_back_with_it(self):
+        """In the shut place of a frame lies also what fills it, in the same box."""
+        trial = trial_of_screen()
+        local = trial.box.to_canonical(torch.from_numpy(np.asarray(trial.own.data)))
+        rim = np.asarray(trial.own.data)[(local.abs() > 0.95).sum(1).numpy() >= 2]
+        (true,) = looks_of("laptop")[0].joints
+        whole = trial.brought(true.motion())
+        frame = replace(trial, own=KDTree(rim)).brought(true.motion())
+        assert 0 < len(frame) < 0.8 * len(whole)
+        back = true.motion().inverse().apply(frame.means.double())
+        assert KDTree(rim).query(back.numpy())[0].max() < 0.15
 
     def test_the_photos_of_both_states_speak_for_the_true_motion(self):
         (true,) = looks_of("laptop")[0].joints

@@ -28,6 +28,7 @@ _PEEPS = 0.01  # ...if it costs and helps the other state's photos no more than 
 _SLIDES = 32  # lengths up to what was found that are tried, and...
 _FARTHER = 1.5  # ...up to so many times as much, as long as it is in sight where it...
 _IN_THE_WAY = 0.05  # ...costs the other state's photos this share of its weight; fronts that are shut cost .03 and less
+_HOLLOW = 6.0  # voxels: what lies in the part's box, but farther from all of its points, is seen through it
 NOISE = 0.002  # fraction of the photo error below which a difference says nothing
 
 
@@ -180,11 +181,14 @@ class Trial:
     def brought(self, motion: SE3) -> Splats:
         """What lies in the other state where a motion takes the part, and no nearer to another part; still there."""
         lying = self.others[self._lying_in(self.box.moved(motion))]
-        if self.taken is None or not len(lying):
+        if not len(lying):
             return lying
         means = lying.means.double()
         from_own = self.own.query(motion.inverse().apply(means).numpy())[0]
-        return lying[torch.from_numpy(from_own < self.taken.query(means.numpy())[0] + 0.5 * self.near)]
+        there = from_own < _HOLLOW * self.near
+        if self.taken is not None:
+            there &= from_own < self.taken.query(means.numpy())[0] + 0.5 * self.near
+        return lying[torch.from_numpy(there)]
 
     @cached_property
     def in_sight(self) -> float:
@@ -235,7 +239,15 @@ class Trial:
     def out_of_sight(self, motion: SE3) -> bool:
         """Whether the photos of the other state neither mind nor show the part where a motion takes it."""
         unseen = self.there.error(self.piece, motion) < self.there.absent + _PEEPS * self.weight
-        return unseen and self.there.footprint(self.piece.moved(motion)) < _GONE * self.in_sight
+        return unseen and not self.in_view(motion, self.there)
+
+    def in_view(self, motion: SE3, scene: Scene) -> bool:
+        """Whether more than a little of the part is before all else of a scene where a motion takes it."""
+        return scene.footprint(self.piece.moved(motion)) >= _GONE * self.in_sight
+
+    def in_the_way(self, hypothesis: Hypothesis) -> bool:
+        """Whether the photos of the other state mind the part where a judged hypothesis takes it."""
+        return hypothesis.image_error > self.there.absent + _IN_THE_WAY * self.weight
 
     def gone_in(self, hypothesis: Hypothesis) -> float:
         """What speaks against a judged turn that takes the part out of sight, in mean error.
@@ -309,7 +321,7 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
     turn, angle = screw_at(motion, "revolute", centre)
     ways: list[list[tuple[Screw, float]]] = [[], [], [(slide, length)], [(turn, angle)]]
     for way, (screw, q) in zip(ways, ((slide, length), (turn, angle)), strict=False):
-        for straight in (_straight(screw, base), _straight(screw, box)):
+        for straight in (straightened(screw, base), straightened(screw, box)):
             way.append((straight, q * float(straight.axis @ screw.axis)))
     enough = hypothesis.error + share * max(trial.absent - hypothesis.error, 0.0) + NOISE * trial.absent
     for way in ways:
@@ -331,10 +343,11 @@ def along_base(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypothesis:
         trial: the part between the photos.
         base: the base's box.
     """
-    if kind_of(hypothesis.motion) == "revolute" and not trial.out_of_sight(hypothesis.motion):
+    fits = not (trial.in_the_way(hypothesis) or trial.out_of_sight(hypothesis.motion))
+    if kind_of(hypothesis.motion) == "revolute" and fits:
         return hypothesis
     own, q = screw_at(hypothesis.motion, "prismatic", trial.box.T_world_box.xyz)
-    straight = _straight(own, base)
+    straight = straightened(own, base)
     return trial.judge(trial.moved(hypothesis, straight.motion(q * float(straight.axis @ own.axis))))
 
 
@@ -380,13 +393,24 @@ def just_out_of_sight(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypoth
         return next(filter(trial.out_of_sight, map(screw.motion, lengths)), None)
 
     motion = first_hidden(own, lengths[:_SLIDES])
-    if motion is None and hypothesis.image_error < there.absent + _IN_THE_WAY * weight:
+    if motion is None and not trial.in_the_way(hypothesis):
         return hypothesis
-    motion = first_hidden(_straight(own, base), lengths) or motion or first_hidden(own, lengths[_SLIDES:])
+    motion = first_hidden(straightened(own, base), lengths) or motion or first_hidden(own, lengths[_SLIDES:])
     return hypothesis if motion is None else trial.judge(trial.moved(hypothesis, motion))
 
 
-def _straight(screw: Screw, box: Box) -> Screw:
+def shortest_out_of_sight(trial: Trial, base: Box) -> SE3 | None:
+    """The shortest slide along an axis of the base, no longer than the base, that takes the part out of sight; None if none."""
+    axes = base.T_world_box.rotation.T
+    for share in np.arange(1, _SLIDES + 1) / _SLIDES:
+        for axis in (*axes, *-axes):
+            motion = Screw("prismatic", axis, trial.box.T_world_box.xyz).motion(2 * share * float(base.half_extents.max()))
+            if trial.out_of_sight(motion):
+                return motion
+    return None
+
+
+def straightened(screw: Screw, box: Box) -> Screw:
     """The screw along the nearest axis of a box, the same way."""
     axes = box.T_world_box.rotation.T
     along = axes @ screw.axis

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ..geometry import SE3, Box, screw_at
+from ..geometry import SE3, Box, Screw, screw_at
 from ..joints import kind_of
 from .config import SearchConfig
 from .cue import Cluster, Points, StateLook, linked
@@ -22,11 +22,12 @@ from .hypotheses import (
     oddity,
     stack_motions,
 )
-from .judge import NOISE, Scene, Trial, just_out_of_sight, measured
+from .judge import NOISE, Scene, Trial, just_out_of_sight, measured, shortest_out_of_sight, straightened
 from .pieces import MovingPart, Pieces
 from .review import PartReview
 
 _TORN = 0.8  # of what a cluster explained as one part: several that explain less together are that part, torn to pieces
+_ALIGNED = 0.9998  # cosine between a motion's axis and the base's: a degree
 _CLAIM = 0.1  # of a cluster's points: so much of it moves along with a part found before, or it is tried as it is
 
 
@@ -76,15 +77,32 @@ class PartSearch:
         self.review = PartReview(self.pieces)
         self.config = config
         self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
+        self._waited: dict[int, MovingPart] = {}  # clusters that were to be looked at again, as what they then were
 
     def _divided(self, part: MovingPart, trial: Trial, known_cut: bool) -> list[Points]:
         """The points of a part as those of several, if it turns out to be several parts; else all of them.
+
+        Several that go different ways along one line, as doors above each other do, look best together when askew: then how
+        far each would rather go is also asked along the nearest axis of the base.
+        """
+        motion = part.hypothesis.motion
+        screw, q = screw_at(motion, kind_of(motion), trial.box.T_world_box.xyz)
+        straight = straightened(screw, self.pieces.base_box)
+        aligned = float(straight.axis @ screw.axis)
+        ways = [(screw, q)] if aligned > _ALIGNED else [(screw, q), (straight, q * aligned)]
+        for way in ways:
+            several = self._divided_along(*way, part, trial, known_cut)
+            if len(several) > 1:
+                return several
+        return [part.points]
+
+    def _divided_along(self, screw: Screw, q: float, part: MovingPart, trial: Trial, known_cut: bool) -> list[Points]:
+        """The same, by how far along one way each piece would rather go.
 
         What shows in the other state says it splat by splat; what was shut there by its fronts.  Unless it was cut before, it
         is also cut across where its pieces had better go further or less far.
         """
         config, box, pieces = self.config, trial.box, self.pieces
-        screw, q = screw_at(part.hypothesis.motion, kind_of(part.hypothesis.motion), box.T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
         shows = trial.shows(part.hypothesis)
         if shows:
@@ -99,7 +117,7 @@ class PartSearch:
         others = trial.others.means.double()
         fronts = trial.others[torch.stack([box.moved(motions[f]).contains(others) for f in range(len(FACTORS))]).any(0)]
         support = trial.here.support(fronts, motions.inverse())
-        places = box.moved(part.hypothesis.motion).to_canonical(fronts.means.double()).numpy()
+        places = box.moved(screw.motion(q)).to_canonical(fronts.means.double()).numpy()
         if shows:
             support = np.concatenate([support, there], 1)
             places = np.concatenate([places, box.to_canonical(means).numpy()])
@@ -140,6 +158,21 @@ class PartSearch:
         found.update(takers)
         return left
 
+    def _out_of_sight(self, part: MovingPart, trial: Trial, parts: list[MovingPart]) -> MovingPart | None:
+        """A part that nothing explains, where the other state's photos do not show it; None if they would.
+
+        It came from somewhere: from where it was found to go, or from behind the parts found before, straight along the base.
+        """
+        if trial.out_of_sight(part.hypothesis.motion):
+            return part
+        motion = shortest_out_of_sight(trial, self.pieces.base_box) if parts else None
+        if motion is None:
+            return None
+        bare = self.pieces.scene(1 - part.state, self.pieces.rest([], part.state))
+        if not trial.in_view(motion, bare):  # it was not they that hid it
+            return None
+        return replace(part, hypothesis=trial.judge(trial.moved(part.hypothesis, motion)))
+
     def _left_of(self, index: int, parts: list[MovingPart]) -> list[int]:
         """What is left to explain of a cluster, by indices: itself, if no part lies there, or new clusters in its place."""
         cluster = self.pieces.clusters[index]
@@ -174,7 +207,6 @@ class PartSearch:
         count = len(self.pieces)
         todo = list(range(count))
         waiting: set[int] = set()  # clusters that may be several parts: those of the other state may tell them apart
-        waited: set[int] = set()
         while todo:
             index = todo.pop(0)
             yield min(index, count)
@@ -192,11 +224,12 @@ class PartSearch:
                 todo = self._taken(part.state, [left.points] if left.pieces else []) + todo
                 continue
             one = Found(part, -trial.cost(part.hypothesis))
-            several = self._divided(part, trial, index in self.pieces.apart) if part.gain > NOISE else [part.points]
+            worthy = part.gain > NOISE and one.worth > 0
+            several = self._divided(part, trial, index in self.pieces.apart) if worthy else [part.points]
             doubtful = unclear or len(several) > 1
-            if doubtful and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
+            if doubtful and index not in self._waited and self._is_open(1 - part.state, set(todo) - explained):
                 waiting.add(index)
-                waited.add(index)
+                self._waited[index] = part
                 at_last = [*(i for i in todo if i in waiting), index]
                 todo = [i for i in todo if i not in waiting] + sorted(
                     at_last, key=lambda i: -len(self.pieces.clusters[i].points)
@@ -210,12 +243,13 @@ class PartSearch:
                 continue
             share = len(part.points) / len(self.pieces.looks[part.state].points)
             large = share > self.config.large
-            if part.gain < (-self.config.harm if large else NOISE) and not (
-                large and trial.out_of_sight(part.hypothesis.motion)
-            ):
-                if large:
-                    refused[index] = (part.state, share)
-                continue
+            if part.gain < (-self.config.harm if large else NOISE):
+                part = self._out_of_sight(part, trial, parts) if large else None
+                if part is None:
+                    if large:
+                        refused[index] = (one.part.state, share)
+                    continue
+                one = replace(one, part=part)
             explained |= members | self.pieces.explained_by(part)
             found[index] = one
         self.left_over = [what for index, what in refused.items() if index not in explained]
@@ -235,6 +269,9 @@ class PartSearch:
         siblings = [i for i in open_ if pieces.clusters[i].state == state and i != index and not self._known_apart(i, index)]
         wholes = self._unions(siblings, {index})
         motions = candidate_motions(wholes, pieces.base_box, list(itertools.product(wholes, self._unions(arrivals, set()))))
+        if self._waited:  # which may show in the other state as this one
+            known = stack_motions([part.motion if state == 0 else part.motion.inverse() for part in self._waited.values()])
+            motions = SE3(torch.cat([known.wxyz_xyz, motions.wxyz_xyz]))
         rough = hull_scores(motions, pieces.sample(cluster.points, 40), hull, nothing, box)[0]
         motions = motions[np.flatnonzero(rough < rough.min() + 1.0)]
         points, landing = pieces.sample(cluster.points, 300), pieces.sample(self._landing(arrivals), 300)
