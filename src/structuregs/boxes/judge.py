@@ -333,10 +333,10 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
 
 
 def along_base(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypothesis:
-    """The hypothesis; a slide, or a turn out of sight, becomes a slide along the nearest axis of the base, whatever that costs.
+    """The hypothesis; a slide, or a turn out of sight or into the way, becomes a slide along the base, whatever that costs.
 
     For what does not show in the other state: photos know nothing of its way, only of what happens to lie there.  What has
-    gone in somewhere are drawers and trays; a door that is shut is seen (see `Trial.gone_in`).
+    gone in somewhere are drawers and trays; a door that is shut is seen (see `Trial.gone_in`), and spoils no photo.
 
     Args:
         hypothesis: a judged motion.
