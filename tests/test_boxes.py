@@ -336,18 +336,18 @@ def doors_above_each_other(lower: float, upper: float) -> tuple[Trial, Screw]:
     hinge = Screw("revolute", torch.tensor([0.0, 1, 0], dtype=F64), torch.tensor([0.4, 0, -0.4], dtype=F64))
     beside = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0.45, 0, 0], dtype=F64))
     post = panels(Box(beside, torch.full((3,), 0.05, dtype=F64)), 0.5)
-    shut, opened, points = [], [], []
+    shut, opened = [], []
     for level, grey, degrees in ((-0.2, 0.2, lower), (0.2, 0.8, upper)):
         at = SE3.from_quat(NO_MOTION.wxyz, torch.tensor([0, level, -0.4], dtype=F64))
         box = Box(at, torch.tensor([0.4, 0.2, 0.02], dtype=F64))
         shut.append(panels(box, grey))
         opened.append(shut[-1].moved(hinge.motion(math.radians(degrees))))
-        points.append(opened[-1].means.double().numpy())
-    both, piece, others = np.concatenate(points), Splats.concatenate(opened), Splats.concatenate([post, *shut])
+    piece, others = Splats.concatenate(opened), Splats.concatenate([post, *shut])
     there, here = scene_of([post, *shut], post), scene_of([post, *opened], post)
     weight = here.absent - here.error(piece, NO_MOTION)
-    own = KDTree(both)
-    trial = Trial(there, here, others, piece, box_around(both, 0.01), weight, weight, 0.02, own, taken=None, least=0.1 * weight)
+    own = KDTree(piece.means.double().numpy())
+    box = box_around(own.data, 0.01)
+    trial = Trial(there, here, others, piece, box, weight, weight, 0.02, own, taken=None, least=0.1 * weight)
     return trial, hinge
 
 

@@ -321,8 +321,7 @@ def simplest(hypothesis: Hypothesis, trial: Trial, base: Box, share: float) -> H
     turn, angle = screw_at(motion, "revolute", centre)
     ways: list[list[tuple[Screw, float]]] = [[], [], [(slide, length)], [(turn, angle)]]
     for way, (screw, q) in zip(ways, ((slide, length), (turn, angle)), strict=False):
-        for straight in (straightened(screw, base), straightened(screw, box)):
-            way.append((straight, q * float(straight.axis @ screw.axis)))
+        way += [straightened(screw, q, base), straightened(screw, q, box)]
     enough = hypothesis.error + share * max(trial.absent - hypothesis.error, 0.0) + NOISE * trial.absent
     for way in ways:
         judged = [trial.judge(trial.moved(hypothesis, screw.motion(q))) for screw, q in way]
@@ -343,12 +342,11 @@ def along_base(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypothesis:
         trial: the part between the photos.
         base: the base's box.
     """
-    fits = not (trial.in_the_way(hypothesis) or trial.out_of_sight(hypothesis.motion))
-    if kind_of(hypothesis.motion) == "revolute" and fits:
+    motion = hypothesis.motion
+    if kind_of(motion) == "revolute" and not (trial.in_the_way(hypothesis) or trial.out_of_sight(motion)):
         return hypothesis
-    own, q = screw_at(hypothesis.motion, "prismatic", trial.box.T_world_box.xyz)
-    straight = straightened(own, base)
-    return trial.judge(trial.moved(hypothesis, straight.motion(q * float(straight.axis @ own.axis))))
+    straight, q = straightened(*screw_at(motion, "prismatic", trial.box.T_world_box.xyz), base)
+    return trial.judge(trial.moved(hypothesis, straight.motion(q)))
 
 
 def measured(hypothesis: Hypothesis, trial: Trial) -> Hypothesis:
@@ -395,7 +393,7 @@ def just_out_of_sight(hypothesis: Hypothesis, trial: Trial, base: Box) -> Hypoth
     motion = first_hidden(own, lengths[:_SLIDES])
     if motion is None and not trial.in_the_way(hypothesis):
         return hypothesis
-    motion = first_hidden(straightened(own, base), lengths) or motion or first_hidden(own, lengths[_SLIDES:])
+    motion = first_hidden(straightened(own, q, base)[0], lengths) or motion or first_hidden(own, lengths[_SLIDES:])
     return hypothesis if motion is None else trial.judge(trial.moved(hypothesis, motion))
 
 
@@ -410,9 +408,10 @@ def shortest_out_of_sight(trial: Trial, base: Box) -> SE3 | None:
     return None
 
 
-def straightened(screw: Screw, box: Box) -> Screw:
-    """The screw along the nearest axis of a box, the same way."""
+def straightened(screw: Screw, q: float, box: Box) -> tuple[Screw, float]:
+    """The screw along the nearest axis of a box, the same way, and as much of `q` as goes along it."""
     axes = box.T_world_box.rotation.T
     along = axes @ screw.axis
     nearest = int(along.abs().argmax())
-    return replace(screw, axis=axes[nearest] * along[nearest].sign())
+    straight = replace(screw, axis=axes[nearest] * along[nearest].sign())
+    return straight, q * float(straight.axis @ screw.axis)

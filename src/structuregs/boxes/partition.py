@@ -87,10 +87,9 @@ class PartSearch:
         """
         motion = part.hypothesis.motion
         screw, q = screw_at(motion, kind_of(motion), trial.box.T_world_box.xyz)
-        straight = straightened(screw, self.pieces.base_box)
-        aligned = float(straight.axis @ screw.axis)
-        ways = [(screw, q)] if aligned > _ALIGNED else [(screw, q), (straight, q * aligned)]
-        for way in ways:
+        straight = straightened(screw, q, self.pieces.base_box)
+        aligned = float(straight[0].axis @ screw.axis) > _ALIGNED
+        for way in [(screw, q)] if aligned else [(screw, q), straight]:
             several = self._divided_along(*way, part, trial, known_cut)
             if len(several) > 1:
                 return several
@@ -244,13 +243,13 @@ class PartSearch:
             share = len(part.points) / len(self.pieces.looks[part.state].points)
             large = share > self.config.large
             if part.gain < (-self.config.harm if large else NOISE):
-                part = self._out_of_sight(part, trial, parts) if large else None
-                if part is None:
-                    if large:
-                        refused[index] = (one.part.state, share)
+                unseen = self._out_of_sight(part, trial, parts) if large else None
+                if large and unseen is None:
+                    refused[index] = (part.state, share)
+                if unseen is None:
                     continue
-                one = replace(one, part=part)
-            explained |= members | self.pieces.explained_by(part)
+                one = replace(one, part=unseen)
+            explained |= members | self.pieces.explained_by(one.part)
             found[index] = one
         self.left_over = [what for index, what in refused.items() if index not in explained]
         return [one.part for one in undivided(found, divisions, explained).values()]
@@ -270,7 +269,7 @@ class PartSearch:
         wholes = self._unions(siblings, {index})
         motions = candidate_motions(wholes, pieces.base_box, list(itertools.product(wholes, self._unions(arrivals, set()))))
         if self._waited:  # which may show in the other state as this one
-            known = stack_motions([part.motion if state == 0 else part.motion.inverse() for part in self._waited.values()])
+            known = stack_motions([part.motion_from(state) for part in self._waited.values()])
             motions = SE3(torch.cat([known.wxyz_xyz, motions.wxyz_xyz]))
         rough = hull_scores(motions, pieces.sample(cluster.points, 40), hull, nothing, box)[0]
         motions = motions[np.flatnonzero(rough < rough.min() + 1.0)]

@@ -45,7 +45,11 @@ class MovingPart:
     @property
     def motion(self) -> SE3:
         """From state 0 to state 1, in the world, float64."""
-        return self.hypothesis.motion.inverse() if self.state else self.hypothesis.motion
+        return self.motion_from(0)
+
+    def motion_from(self, state: int) -> SE3:
+        """From a state to the other, in the world, float64."""
+        return self.hypothesis.motion if state == self.state else self.hypothesis.motion.inverse()
 
     def points_in(self, state: int) -> Float64[np.ndarray, "P 3"]:
         """Its points as they stand in a state."""

@@ -157,7 +157,7 @@ class PartReview:
         while index < len(parts) > 1:
             part, others = parts[index], parts[:index] + parts[index + 1 :]
             trial = self._again(part, others)
-            shared = [p.motion if part.state == 0 else p.motion.inverse() for p in others]
+            shared = [other.motion_from(part.state) for other in others]
             own = part.hypothesis
             as_they_move = [trial.judge(trial.moved(own, T)) for T in shared]
             starts = [*(trial.judge(h) for h in (own, *part.rivals[:2])), *as_they_move]
