@@ -37,9 +37,10 @@ from structuregs.boxes.hypotheses import (
     stack_motions,
     turn_about,
 )
-from structuregs.boxes.judge import Scene, Trial, along_base, just_out_of_sight, refine, shortest_out_of_sight, simplest
+from structuregs.boxes.judge import Scene, Trial
 from structuregs.boxes.partition import Division, Found, undivided
 from structuregs.boxes.pieces import Pieces
+from structuregs.boxes.refine import along_base, just_out_of_sight, refine, shortest_out_of_sight, simplest
 from structuregs.boxes.review import PartReview
 from structuregs.capture import Capture, ImageStack, TrueJoint
 from structuregs.geometry import SE3, Box, Camera, Screw, screw_at
@@ -826,6 +827,16 @@ class TestDivide:
             assert (side * piece[:, 0] > -0.1).all()
             assert abs(len(piece) - 1500) < 150
 
+    def test_what_hardly_minds_either_way_is_not_taken_for_a_part_because_it_is_large(self):
+        """A fifth on the left says loudly where to go; the half on the right thinks the same, but hardly minds."""
+        points, means, _ = self.boards()
+        left, hardly = means[:, 0] < -0.6, means[:, 0] > 0
+        loud = np.where(left, 3.0, np.where(hardly, 0.1, 1.0))
+        support = loud * self.support(means, np.where(left | hardly, 0.6, 1.0)) + np.where(hardly, 0.4, 0.0)
+        pieces = divide(points, means, support, 1.2, 0.0, CueConfig(), voxel=0.05)
+        ends = sorted((piece[:, 0].min(), piece[:, 0].max()) for piece in pieces)
+        np.testing.assert_allclose(ends, [(-1, -0.5), (-0.5, 1)], atol=0.1)
+
     def test_one_way_is_one_part(self):
         (piece,) = self.pieces(1.0)
         assert len(piece) == 3000
@@ -913,15 +924,17 @@ class TestMovingAlong:
     """A panel and a tray that hang together; the panel moves along with a door, whose photos show nothing of the tray."""
 
     @staticmethod
-    def belongs(peak: float, so_far: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """What is said to move along, and what is the panel."""
+    def belongs(peak: float, so_far: float = 0.0, door: tuple[float, float] = (-1, 0)) -> tuple[np.ndarray, np.ndarray]:
+        """What is said to move along, and what is the panel; the door lies above, between two places along x."""
         generator = np.random.default_rng(0)
         points, means = (generator.uniform([-1, -0.02, 0], [1, 0.02, 1], (n, 3)) for n in (3000, 600))
         panel = means[:, 0] < 0
         shown = 1 - 2 * np.abs(np.array(AROUND)[:, None] - peak)
         support = np.where(panel, 0.4 * shown, 0.0) + 0.05 * generator.standard_normal((len(AROUND), 600))
         before = np.full(600, so_far)
-        return moving_along(points, means, support, before, np.ones(600), CueConfig(), voxel=0.05), points[:, 0] < 0
+        low, high = door
+        part = generator.uniform([low, -0.02, 1], [high, 0.02, 2], (2000, 3))
+        return moving_along(part, points, means, support, before, np.ones(600), CueConfig(), voxel=0.05), points[:, 0] < 0
 
     def test_the_panel_belongs_to_the_door_and_the_tray_does_not(self):
         found, panel = self.belongs(1.0)
@@ -933,6 +946,11 @@ class TestMovingAlong:
 
     def test_what_is_explained_as_well_already_stays(self):
         assert not self.belongs(1.0, so_far=0.38)[0].any()
+
+    def test_what_no_box_holds_with_the_door_belongs_to_another(self):
+        """As next to a hinge that two doors share."""
+        assert self.belongs(1.0, door=(-1.2, 0.2))[0].any()
+        assert not self.belongs(1.0, door=(-6, 0))[0].any()
 
 
 class TestBoxesOfParts:

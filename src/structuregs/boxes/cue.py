@@ -133,6 +133,12 @@ def split_where_hollow(points: Float64[np.ndarray, "P 3"], thinnest: float, rati
     return [piece for side in (low, ~low) for piece in split_where_hollow(points[side], thinnest, ratio)]
 
 
+def one_box_holds(one: Points, two: Points, thinnest: float, ratio: float) -> bool:
+    """Whether a box around both is hardly more than their own boxes, which have at least this share of its volume."""
+    whole, *both = (float(box_around(points, thinnest).volume) for points in (np.concatenate([one, two]), one, two))
+    return sum(both) > ratio * whole
+
+
 def box_around(
     points: Float64[np.ndarray, "P 3"], thinnest: float, trim: float = 0.002, axes: Float64[Tensor, "3 3"] | None = None
 ) -> Box:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 from scipy.spatial import KDTree
 
 from ..geometry import Box, Screw
-from .cue import CueConfig, Points, box_around, linked
+from .cue import CueConfig, Points, box_around, linked, one_box_holds
 
 FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
 """How far along its own way a motion is tried, against what suits the cluster best as a whole."""
@@ -59,11 +59,13 @@ def divide(
     best = local.argmax(0)
     strength = np.bincount(best, own, minlength=len(support))
     mode = int(np.convolve(strength, np.ones(3), "same").argmax())
-    agrees = _vote(points, means, (np.abs(best - mode) <= 1) & (own > 0), own)
-    cores = linked(points[agrees], cue, voxel)
+    agrees = (np.abs(best - mode) <= 1) & (own > 0)
+    cores = linked(points[_vote(points, means, agrees, own)], cue, voxel)
     if not cores:
         return [points]
-    box = box_around(max(cores, key=len), thinnest=0.5 * voxel, trim=0.02)
+    nearest = np.argmin([KDTree(core).query(means[agrees])[0] for core in cores], 0)
+    strongest = int(np.bincount(nearest, own[agrees], minlength=len(cores)).argmax())
+    box = box_around(cores[strongest], thinnest=0.5 * voxel, trim=0.02)
     within = box.contains(torch.from_numpy(points), margin=voxel).numpy()
     pieces = [points[within], *linked(points[~within], cue, voxel)]
     nearest = np.argmin([KDTree(piece).query(points)[0] for piece in pieces], 0)
@@ -71,6 +73,7 @@ def divide(
 
 
 def moving_along(
+    part: Points,
     points: Points,
     means: Points,
     support: Float64[np.ndarray, "F N"],
@@ -82,9 +85,11 @@ def moving_along(
     """Which points beside a part belong to it: what its motion explains, and none that goes further or less far.
 
     A door's panel and the tray behind it hang together in the state in which both are open.  Shut, the panel shows itself;
-    what the door's motion takes out of sight, or into the way, is something else.
+    what the door's motion takes out of sight, or into the way, is something else.  So is what no box holds with the part:
+    near a hinge that two doors share, one above the other, what is of the one moves about like the other.
 
     Args:
+        part: points of the part, in the world.
         points: what lies beside the part, in the world.
         means: centres of its splats.
         support: of each splat for each factor of `AROUND` of the part's motion (see `Scene.support`).
@@ -102,7 +107,7 @@ def moving_along(
         chosen = KDTree(piece).query(points)[0] == 0
         best = int(np.argmax(support[:, np.unique(near[chosen])].sum(1)))
         clear = surely[chosen].mean() > 0.5 and 0 < best < len(AROUND) - 1
-        belongs |= chosen & bool(clear)
+        belongs |= chosen & bool(clear and one_box_holds(part, piece, 0.5 * voxel, cue.hollow))
     return belongs
 
 

@@ -22,8 +22,9 @@ from .hypotheses import (
     oddity,
     stack_motions,
 )
-from .judge import NOISE, Scene, Trial, just_out_of_sight, measured, shortest_out_of_sight, straightened
+from .judge import NOISE, Scene, Trial
 from .pieces import MovingPart, Pieces
+from .refine import just_out_of_sight, measured, shortest_out_of_sight, straightened
 from .review import PartReview
 
 _TORN = 0.8  # of what a cluster explained as one part: several that explain less together are that part, torn to pieces
@@ -77,7 +78,6 @@ class PartSearch:
         self.review = PartReview(self.pieces)
         self.config = config
         self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
-        self._waited: dict[int, MovingPart] = {}  # clusters that were to be looked at again, as what they then were
 
     def _divided(self, part: MovingPart, trial: Trial, known_cut: bool) -> list[Points]:
         """The points of a part as those of several, if it turns out to be several parts; else all of them.
@@ -181,7 +181,7 @@ class PartSearch:
             return [index]
         if share > 0.6:
             return []
-        return self._replaced(index, linked(cluster.points[~np.any(within, 0)], self.config.cue, self.pieces.voxel))
+        return self._taken(cluster.state, linked(cluster.points[~np.any(within, 0)], self.config.cue, self.pieces.voxel))
 
     def search(self, count: int | None) -> list[MovingPart]:
         """The moving parts with the motions that the photos prefer: all that explain something, or the `count` best."""
@@ -205,7 +205,8 @@ class PartSearch:
         refused: dict[int, tuple[int, float]] = {}
         count = len(self.pieces)
         todo = list(range(count))
-        waiting: set[int] = set()  # clusters that may be several parts: those of the other state may tell them apart
+        waiting: set[int] = set()  # clusters that nothing fits well: those of the other state may tell what they hold
+        waited: set[int] = set()
         while todo:
             index = todo.pop(0)
             yield min(index, count)
@@ -225,10 +226,9 @@ class PartSearch:
             one = Found(part, -trial.cost(part.hypothesis))
             worthy = part.gain > NOISE and one.worth > 0
             several = self._divided(part, trial, index in self.pieces.apart) if worthy else [part.points]
-            doubtful = unclear or len(several) > 1
-            if doubtful and index not in self._waited and self._is_open(1 - part.state, set(todo) - explained):
+            if unclear and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
                 waiting.add(index)
-                self._waited[index] = part
+                waited.add(index)
                 at_last = [*(i for i in todo if i in waiting), index]
                 todo = [i for i in todo if i not in waiting] + sorted(
                     at_last, key=lambda i: -len(self.pieces.clusters[i].points)
@@ -249,7 +249,7 @@ class PartSearch:
                 if unseen is None:
                     continue
                 one = replace(one, part=unseen)
-            explained |= members | self.pieces.explained_by(one.part)
+            explained |= members | {i for i in self.pieces.explained_by(one.part) if not self._known_apart(i, index)}
             found[index] = one
         self.left_over = [what for index, what in refused.items() if index not in explained]
         return [one.part for one in undivided(found, divisions, explained).values()]
@@ -268,9 +268,6 @@ class PartSearch:
         siblings = [i for i in open_ if pieces.clusters[i].state == state and i != index and not self._known_apart(i, index)]
         wholes = self._unions(siblings, {index})
         motions = candidate_motions(wholes, pieces.base_box, list(itertools.product(wholes, self._unions(arrivals, set()))))
-        if self._waited:  # which may show in the other state as this one
-            known = stack_motions([part.motion_from(state) for part in self._waited.values()])
-            motions = SE3(torch.cat([known.wxyz_xyz, motions.wxyz_xyz]))
         rough = hull_scores(motions, pieces.sample(cluster.points, 40), hull, nothing, box)[0]
         motions = motions[np.flatnonzero(rough < rough.min() + 1.0)]
         points, landing = pieces.sample(cluster.points, 300), pieces.sample(self._landing(arrivals), 300)

@@ -14,7 +14,8 @@ from ..model import Splats
 from .config import SearchConfig
 from .cue import Cluster, Points, StateLook, base_axes, box_around, clusters
 from .hypotheses import Hypothesis
-from .judge import Scene, Trial, along_base, refine, simplest
+from .judge import Scene, Trial
+from .refine import along_base, refine, simplest
 
 
 @dataclass(frozen=True)

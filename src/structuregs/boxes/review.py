@@ -12,11 +12,12 @@ from torch import Tensor
 from ..geometry import SE3, screw_at
 from ..joints import kind_of
 from .alike import Face, Overlap, Shown
-from .cue import linked
+from .cue import linked, one_box_holds
 from .divide import AROUND, moving_along
 from .hypotheses import displacements, distinct, flips, stack_motions
-from .judge import Trial, just_out_of_sight, measured
+from .judge import Trial
 from .pieces import MovingPart, Pieces
+from .refine import just_out_of_sight, measured
 
 
 class PartReview:
@@ -79,7 +80,9 @@ class PartReview:
         support = there.support(splats, SE3(torch.cat([motions, giver.hypothesis.motion.wxyz_xyz[None]])))
         needed = here.support(splats, SE3.identity(1, dtype=torch.float64))[0]
         means = splats.means.double().numpy()
-        along = moving_along(giver.points, means, support[:-1], support[-1], needed, self.config.cue, pieces.voxel)
+        along = moving_along(
+            taker.points, giver.points, means, support[:-1], support[-1], needed, self.config.cue, pieces.voxel
+        )
         if not along.any():
             return taker, giver
         left = linked(giver.points[~along], self.config.cue, pieces.voxel)
@@ -197,9 +200,8 @@ class PartReview:
         """Whether two parts touch where the one was found (the clustering's reach), and one box holds both about as well."""
         if not self.touch(part, other):
             return False
-        theirs = other.points_in(part.state)
-        whole, *both = (float(self.pieces.box(p).volume) for p in (np.concatenate([part.points, theirs]), part.points, theirs))
-        return sum(both) > self.config.cue.hollow * whole
+        thinnest, hollow = 0.5 * self.pieces.voxel, self.config.cue.hollow
+        return one_box_holds(part.points, other.points_in(part.state), thinnest, hollow)
 
     def touch(self, one: MovingPart, other: MovingPart) -> bool:
         """Whether two parts touch where the one was found (the clustering's reach)."""
