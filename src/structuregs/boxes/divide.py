@@ -6,7 +6,7 @@ all of it in place; but each part's splats say which of several motions fits *th
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import KDTree
 
 from ..geometry import Box, Screw
@@ -40,7 +40,8 @@ def divide(
 
     The splats of one part like the same factor best, and their support at that factor adds up to about what each could
     reach with a factor of its own.  Where together they could reach much more, the splats that agree with the strongest
-    mode are one part, with all points in their box, and what is left falls into pieces that hang together.
+    mode are one part, where they reach most, with all points in their box, and what is left falls into pieces that hang
+    together.
 
     Args:
         points: of the cluster, in the world.
@@ -63,13 +64,17 @@ def divide(
     cores = linked(points[_vote(points, means, agrees, own)], cue, voxel)
     if not cores:
         return [points]
-    nearest = np.argmin([KDTree(core).query(means[agrees])[0] for core in cores], 0)
-    strongest = int(np.bincount(nearest, own[agrees], minlength=len(cores)).argmax())
+    strongest = int(np.bincount(_nearest(cores, means[agrees]), own[agrees], minlength=len(cores)).argmax())
     box = box_around(cores[strongest], thinnest=0.5 * voxel, trim=0.02)
     within = box.contains(torch.from_numpy(points), margin=voxel).numpy()
     pieces = [points[within], *linked(points[~within], cue, voxel)]
-    nearest = np.argmin([KDTree(piece).query(points)[0] for piece in pieces], 0)
+    nearest = _nearest(pieces, points)
     return [points[nearest == k] for k in range(len(pieces))]
+
+
+def _nearest(pieces: list[Points], points: Points) -> Int64[np.ndarray, " P"]:
+    """Which piece is nearest to each point."""
+    return np.argmin([KDTree(piece).query(points)[0] for piece in pieces], 0)
 
 
 def moving_along(

@@ -223,9 +223,6 @@ class PartSearch:
                 explained |= members
                 todo = self._taken(part.state, [left.points] if left.pieces else []) + todo
                 continue
-            one = Found(part, -trial.cost(part.hypothesis))
-            worthy = part.gain > NOISE and one.worth > 0
-            several = self._divided(part, trial, index in self.pieces.apart) if worthy else [part.points]
             if unclear and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
                 waiting.add(index)
                 waited.add(index)
@@ -234,6 +231,9 @@ class PartSearch:
                     at_last, key=lambda i: -len(self.pieces.clusters[i].points)
                 )
                 continue
+            one = Found(part, -trial.cost(part.hypothesis))
+            worthy = part.gain > NOISE and one.worth > 0
+            several = self._divided(part, trial, index in self.pieces.apart) if worthy else [part.points]
             if len(several) > 1:
                 explained |= members
                 new = self._replaced(min(members), several)
