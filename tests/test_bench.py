@@ -9,7 +9,7 @@ import pytest
 from structuregs import cli
 from structuregs.capture import CaptureError, find_captures
 from structuregs.evaluate import Bench, BenchRow, bench, write_tables
-from structuregs.evaluate.tables import METRICS, compared, joint_by_joint, published, scene_of, trust
+from structuregs.evaluate.tables import METRICS, at_a_glance, compared, joint_by_joint, published, scene_of, trust
 
 FRIDGE, OTHER = Path("data/fridge/10905"), Path("data/desk/7")
 
@@ -103,6 +103,26 @@ class TestTables:
         assert second[:3] == ("", "prismatic (F in 1 of 2)", "0.500")
         (_, lost) = joint_by_joint([BenchRow(OTHER, None, 0, None, "no memory")])
         assert lost[:2] == ("7", "no fit ended: no memory")
+
+    def test_at_a_glance_it_is_all_joints_and_fits_and_what_failed_counts_as_not_right(self):
+        rows = [
+            BenchRow(FRIDGE, None, 0, report(joint(angle=0.1), cd_static=1.0, psnr=31.0)),
+            BenchRow(OTHER, None, 0, report(joint("prismatic", angle=0.2), joint(angle=0.9), cd_static=4.0)),
+            BenchRow(OTHER, None, 1, report(joint("prismatic", angle=0.4), joint(failed=True))),
+            BenchRow(OTHER, None, 2, report(joint("prismatic", angle=0.4), unmatched_parts=[2])),
+            BenchRow(OTHER, None, 3, None, "no memory"),
+        ]
+        _, parts, *lines = at_a_glance(rows)
+        assert parts == ("fits with all parts right", "", "", "", "2 of 5")
+        figures = {line[0]: line[1:] for line in lines}
+        assert figures["axis deg"] == ("0.400", "0.400", "0.900", "5 joints")
+        assert figures["slide"] == ("0.1250", "0.1250", "0.1250", "3 joints")
+        assert figures["CD static"] == ("1.00", "1.75", "4.00", "4 fits")
+        assert figures["PSNR"] == ("30.0", "30.2", "30.0", "4 fits")
+
+    def test_what_no_joint_has_is_no_row(self):
+        lines = at_a_glance([BenchRow(OTHER, None, 0, report(joint("prismatic")))])
+        assert "turn deg" not in {line[0] for line in lines}
 
     def test_trust_counts_what_is_wrong_and_not_flagged(self):
         def numbered(part: int | None, **others) -> dict:

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -134,6 +135,34 @@ def joint_by_joint(rows: Sequence[BenchRow]) -> list[tuple[str, ...]]:
     return table
 
 
+def at_a_glance(rows: Sequence[BenchRow]) -> list[tuple[str, ...]]:
+    """Median, mean and worst of every figure over all joints, or fits, that have it, and how many these are.
+
+    The first row says in how many fits every part is found, of the right type, and none is too many.
+    """
+    reports = [row.report for row in rows if row.report is not None]
+    right = sum(not report["failures"] and not report["unmatched_parts"] for report in reports)
+    table: list[tuple[str, ...]] = [("figure", "median", "mean", "worst", "of")]
+    table.append(("fits with all parts right", "", "", "", f"{right} of {len(rows)}"))
+    joints = [joint for report in reports for joint in report["joints"] if not joint["failed"]]
+    for name, source, field, digits, worst in _FIGURES:
+        values = [value for one in (joints if source == "joints" else reports) if (value := one[field]) is not None]
+        if values:
+            shown = (f"{f(values):.{digits}f}" for f in (statistics.median, statistics.mean, worst))
+            table.append((name, *shown, f"{len(values)} {source}"))
+    return table
+
+
+_FIGURES = (
+    ("axis deg", "joints", "axis_angle_deg", 3, max),
+    ("position", "joints", "axis_position", 4, max),
+    ("turn deg", "joints", "geodesic_deg", 3, max),
+    ("slide", "joints", "translation", 4, max),
+    ("PSNR", "fits", "psnr", 1, min),
+    ("CD static", "fits", "cd_static", 2, max),
+    ("CD movable", "fits", "cd_movable", 2, max),
+    ("CD whole", "fits", "cd_whole", 2, max),
+)
 _WRONG = {"axis_angle_deg": 2.0, "axis_position": 0.02, "geodesic_deg": 2.0, "translation": 0.02}  # beyond these
 
 
@@ -190,6 +219,8 @@ def write_tables(plan: Bench, rows: Sequence[BenchRow]) -> list[Path]:
         name = "all views" if views is None else f"{views} views of each state"
         seeds = ", ".join(str(seed) for seed in plan.seeds)
         text.append(f"## {name[0].upper()}{name[1:]}\n\nPreset `{plan.preset}`, protocol `{plan.protocol}`.\n")
+        text.append(f"Over all captures and seeds {seeds}.\n")
+        text.append(markdown(at_a_glance(here)))
         text.append(f"Means over seeds {seeds} (and joints); Fn: n failures, which the mean leaves out.\n")
         text.append(markdown(compared(here, views)))
         text.append(f"Joint by joint, the worst of seeds {seeds}; {plan.at_once} at a time.\n")
