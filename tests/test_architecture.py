@@ -29,6 +29,7 @@ LEVELS = {
     "export": 5,
     "evaluate": 6,
     "view": 6,
+    "console": 7,
 }
 DOORS = {"__init__", "cli"}
 # The one room that may import a heavy package.

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from door_and_drawer import DOOR, DRAWER, made_of, photographed
-from structuregs import cli
+from structuregs import cli, console
 from structuregs.capture import save_capture, save_truth
 from structuregs.fit.events import Finished, Note, StageStarted, Step
 from structuregs.model import save_object
@@ -163,19 +163,19 @@ def test_a_fits_events_are_followed_to_its_end(capsys):
         Note("one part was dropped"),
         Step("boxes", 2, 0.25, 30.1, 240),
     ]
-    finished = cli._follow([*events, Finished(obj, Path("run"))])
+    finished = console.follow([*events, Finished(obj, Path("run"))])
     assert finished.obj is obj
     printed = capsys.readouterr().out
     assert "one part was dropped" in printed
     assert "loss 0.2500  PSNR 30.1" in printed
     with pytest.raises(RuntimeError, match="without a result"):
-        cli._follow(events)
+        console.follow(events)
 
 
 def test_joints_that_need_a_look_are_named(capsys):
     obj = made_of(DOOR.motion(), DRAWER.motion())
-    cli._print_joints(obj)
+    console.print_joints(obj)
     assert "please look" not in capsys.readouterr().out
     six = made_of(type(DOOR)("revolute", DOOR.axis, DOOR.origin, 0.0, 0.105).motion())
-    cli._print_joints(six)
+    console.print_joints(six)
     assert "part 1, please look: The part turns by 6.0 degrees" in capsys.readouterr().out
