@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from structuregs.boxes import (
@@ -42,6 +43,7 @@ from structuregs.boxes.partition import Division, Found, undivided
 from structuregs.boxes.pieces import Pieces
 from structuregs.boxes.refine import along_base, just_out_of_sight, refine, shortest_out_of_sight, simplest
 from structuregs.boxes.review import PartReview
+from structuregs.boxes.several import _ways, several_in
 from structuregs.capture import Capture, ImageStack, TrueJoint
 from structuregs.geometry import SE3, Box, Camera, Screw, screw_at
 from structuregs.joints import kind_of
@@ -352,6 +354,13 @@ def doors_above_each_other(lower: float, upper: float) -> tuple[Trial, Screw]:
     return trial, hinge
 
 
+def pieces_on(base: Box) -> Pieces:
+    """What the laptop's photos show, with another base's box."""
+    pieces = Pieces(looks_of("laptop")[1], SMALL.search, seed=0)
+    pieces.base_box = base
+    return pieces
+
+
 @dataclass(frozen=True)
 class Loose(Trial):
     """A part that the photos lose little by wherever it goes: `aside` for a unit that it comes to lie aside of `at`."""
@@ -618,19 +627,43 @@ class TestParts:
     def test_doors_above_each_other_that_look_like_one_askew_are_two(self):
         """One motion for doors open by 30 and by 70 degrees leans; only along their hinge does each say how far it goes."""
         trial, hinge = doors_above_each_other(30.0, 70.0)
-        search = PartSearch(looks_of("laptop")[1], SMALL.search, seed=0)
-        search.pieces.base_box = Box(NO_MOTION, torch.tensor([0.4, 0.4, 0.4], dtype=F64))
+        pieces = pieces_on(Box(NO_MOTION, torch.tensor([0.4, 0.4, 0.4], dtype=F64)))
         both = trial.judge(Hypothesis(hinge.motion(-math.radians(50.0)), 0.0, 0.0, 0.0))
         leaning = refine(both, trial, 60, 0.03)
         part = MovingPart(1, (trial.own.data,), leaning, 1.0, trial.weight)
-        screw, q = screw_at(leaning.motion, "revolute", trial.box.T_world_box.xyz)
+        screw, _ = screw_at(leaning.motion, "revolute", trial.box.T_world_box.xyz)
         assert math.degrees(math.acos(abs(float(screw.axis[1])))) > 3
-        assert len(search._divided_along(screw, q, part, trial, False)) == 1
-        several = search._divided(part, trial, False)
+        several = several_in(part, trial, pieces, known_cut=False)
         assert len(several) == 2
         for points in several:
             aside = points[np.abs(points[:, 1]) > 0.05, 1]  # off the faces with which they touch
             assert abs(np.sign(aside).mean()) > 0.95
+        leaning_so = Rotation.align_vectors(screw.axis[None].numpy(), np.array([[0.0, 1, 0]]))[0].as_matrix()
+        leant = SE3.from_rotation(torch.from_numpy(leaning_so), torch.zeros(3, dtype=F64))
+        pieces.base_box = Box(leant, pieces.base_box.half_extents)
+        assert len(several_in(part, trial, pieces, known_cut=False)) == 1, "a base that leans as they do says nothing new"
+
+    def test_a_part_is_asked_along_its_own_way_the_same_along_the_base_and_rivals_that_differ(self):
+        trial = trial_of_screen()
+        pieces = pieces_on(Box(NO_MOTION, torch.ones(3, dtype=F64)))
+
+        def part_with(*motions: SE3) -> MovingPart:
+            best, *rivals = (Hypothesis(motion, 0.0, 0.0, 0.0) for motion in motions)
+            return MovingPart(0, (trial.own.data,), best, 1.0, 0.1, tuple(rivals))
+
+        def slide(x: float, y: float) -> SE3:
+            return SE3.from_quat(NO_MOTION.wxyz, torch.tensor([x, y, 0.0], dtype=F64))
+
+        (own,), also = _ways(part_with(slide(0.3, 0.0), slide(0.5, 0.1), slide(0.1, 0.4), turn(2, 0, 40)), trial, pieces)
+        assert own[1] == pytest.approx(0.3)
+        assert [screw.kind for screw, _ in also] == ["prismatic", "revolute"], (
+            "the first rival slides along x, as the part does"
+        )
+        torch.testing.assert_close(also[0][0].axis, torch.tensor([0.0, 1, 0], dtype=F64))
+        assert also[0][1] == pytest.approx(0.4)
+        ways, also = _ways(part_with(slide(0.3, 0.1), slide(0.2, 0.0)), trial, pieces)
+        assert [float(screw.axis[0]) for screw, _ in ways] == pytest.approx([0.3 / math.hypot(0.3, 0.1), 1.0])
+        assert not also
 
     def test_what_is_seen_through_a_frame_is_not_brought_back_with_it(self):
         """In the shut place of a frame lies also what fills it, in the same box."""
@@ -726,6 +759,16 @@ class TestReview:
             assert kept is right
         assert review.without_doubles([right]) == [right]
 
+    def test_what_lies_in_a_larger_part_s_box_goes_unless_it_explains_what_it_should(self):
+        review = PartReview(Pieces(looks_of("cabinet")[1], SMALL.search, seed=0))
+        parts = parts_of("cabinet")
+        small, large = sorted(parts, key=lambda part: len(part.points))
+        corners = review.pieces.box(np.concatenate([part.points_in(large.state) for part in parts])).corners.numpy()
+        wide = replace(large, pieces=(*large.pieces, corners))
+        scrap = replace(small, hypothesis=replace(small.hypothesis, motion=NO_MOTION))
+        assert review._without_pieces([small, wide]) == [wide, small]
+        assert review._without_pieces([scrap, wide]) == [wide]
+
     def test_a_part_found_in_two_is_one_however_its_lesser_piece_moves(self):
         review, right, wrong = self.found()
         left = right.points[:, 0] < 0.5
@@ -796,6 +839,24 @@ class TestReview:
         pieces = [replace(right, pieces=(right.points[side],), weight=heavy * n) for side, n in ((left, 2), (~left, 1))]
         monkeypatch.setattr(review, "_continues", lambda *_: continues)
         assert len(review.joined(pieces)) == (1 if continues else 2)
+
+    def test_a_small_piece_that_does_not_show_agrees_with_the_part_beside_it_within_what_photos_tell(self):
+        """A corner of the screen that moves 1.2 voxels otherwise: if it is seen, or far off, or heavier, that is another way."""
+        review, right, _ = self.found()
+        far = np.linalg.norm(right.points - right.points[right.points[:, 0].argmax()], axis=1)
+        small, large = (replace(right, pieces=(right.points[side],)) for side in (far < 0.15, far >= 0.15))
+        small = replace(small, weight=0.1 * right.weight)
+        size = float(review.pieces.box(small.points).half_extents.norm())
+        assert 1.2 * review.pieces.voxel > review.config.same * size / 2
+        voxel = np.array([review.pieces.voxel / size])  # between motions, over the half diagonal
+        assert review._agree(small, [large], 1.2 * voxel, False).all()
+        assert not review._agree(small, [large], 1.8 * voxel, False).any()
+        assert not review._agree(small, [large], 1.2 * voxel, True).any()
+        assert not review._agree(replace(small, weight=2 * right.weight), [large], 1.2 * voxel, False).any()
+        away = replace(large, pieces=(large.points - np.array([0.5, 0.0, 0.0]),))
+        assert not review._agree(small, [away], 1.2 * voxel, False).any()
+        assert review._agree(small, [large, away], np.array([0.05, 0.01]), True).all()
+        assert not review._agree(small, [away], np.array([0.05]), True).any()
 
 
 class TestDivide:

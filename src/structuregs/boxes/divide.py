@@ -64,15 +64,15 @@ def divide(
     cores = linked(points[_vote(points, means, agrees, own)], cue, voxel)
     if not cores:
         return [points]
-    strongest = int(np.bincount(_nearest(cores, means[agrees]), own[agrees], minlength=len(cores)).argmax())
+    strongest = int(np.bincount(nearest_of(cores, means[agrees]), own[agrees], minlength=len(cores)).argmax())
     box = box_around(cores[strongest], thinnest=0.5 * voxel, trim=0.02)
     within = box.contains(torch.from_numpy(points), margin=voxel).numpy()
     pieces = [points[within], *linked(points[~within], cue, voxel)]
-    nearest = _nearest(pieces, points)
+    nearest = nearest_of(pieces, points)
     return [points[nearest == k] for k in range(len(pieces))]
 
 
-def _nearest(pieces: list[Points], points: Points) -> Int64[np.ndarray, " P"]:
+def nearest_of(pieces: list[Points], points: Points) -> Int64[np.ndarray, " P"]:
     """Which piece is nearest to each point."""
     return np.argmin([KDTree(piece).query(points)[0] for piece in pieces], 0)
 

@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ..geometry import SE3, Box, Screw, screw_at
-from ..joints import kind_of
+from ..geometry import SE3, Box
 from .config import SearchConfig
 from .cue import Cluster, Points, StateLook, linked
-from .divide import FACTORS, cut_across, divide
 from .hypotheses import (
     Hypothesis,
     candidate_motions,
@@ -24,11 +22,11 @@ from .hypotheses import (
 )
 from .judge import NOISE, Scene, Trial
 from .pieces import MovingPart, Pieces
-from .refine import just_out_of_sight, measured, shortest_out_of_sight, straightened
+from .refine import just_out_of_sight, measured, shortest_out_of_sight
 from .review import PartReview
+from .several import is_unclear, several_in
 
 _TORN = 0.8  # of what a cluster explained as one part: several that explain less together are that part, torn to pieces
-_ALIGNED = 0.9998  # cosine between a motion's axis and the base's: a degree
 _CLAIM = 0.1  # of a cluster's points: so much of it moves along with a part found before, or it is tried as it is
 
 
@@ -78,50 +76,6 @@ class PartSearch:
         self.review = PartReview(self.pieces)
         self.config = config
         self.left_over: list[tuple[int, float]] = []  # state and share of its points of large clusters in no part
-
-    def _divided(self, part: MovingPart, trial: Trial, known_cut: bool) -> list[Points]:
-        """The points of a part as those of several, if it turns out to be several parts; else all of them.
-
-        Several that go different ways along one line, as doors above each other do, look best together when askew: then how
-        far each would rather go is also asked along the nearest axis of the base.
-        """
-        motion = part.hypothesis.motion
-        screw, q = screw_at(motion, kind_of(motion), trial.box.T_world_box.xyz)
-        straight = straightened(screw, q, self.pieces.base_box)
-        aligned = float(straight[0].axis @ screw.axis) > _ALIGNED
-        for way in [(screw, q)] if aligned else [(screw, q), straight]:
-            several = self._divided_along(*way, part, trial, known_cut)
-            if len(several) > 1:
-                return several
-        return [part.points]
-
-    def _divided_along(self, screw: Screw, q: float, part: MovingPart, trial: Trial, known_cut: bool) -> list[Points]:
-        """The same, by how far along one way each piece would rather go.
-
-        What shows in the other state says it splat by splat; what was shut there by its fronts.  Unless it was cut before, it
-        is also cut across where its pieces had better go further or less far.
-        """
-        config, box, pieces = self.config, trial.box, self.pieces
-        motions = screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
-        shows = trial.shows(part.hypothesis)
-        if shows:
-            means = trial.piece.means.double()
-            there = trial.there.support(trial.piece, motions)
-            least = config.divided * part.weight * trial.there.pixels
-            several = divide(part.points, means.numpy(), there, config.mixed, least, config.cue, pieces.voxel)
-            if len(several) > 1:
-                return several
-        if known_cut:
-            return [part.points]
-        others = trial.others.means.double()
-        fronts = trial.others[torch.stack([box.moved(motions[f]).contains(others) for f in range(len(FACTORS))]).any(0)]
-        support = trial.here.support(fronts, motions.inverse())
-        places = box.moved(screw.motion(q)).to_canonical(fronts.means.double()).numpy()
-        if shows:
-            support = np.concatenate([support, there], 1)
-            places = np.concatenate([places, box.to_canonical(means).numpy()])
-        together = config.cut if shows else config.cut_shut
-        return cut_across(part.points, box, places, support, screw, pieces.voxel, together)
 
     def _taken(self, state: int, points: list[Points]) -> list[int]:
         """Indices of new clusters."""
@@ -218,7 +172,7 @@ class PartSearch:
             if index in explained:
                 continue
             part, members, trial = self._try(index, parts, explained)
-            unclear = trial.explained(part.hypothesis) < self.config.clear_case * trial.most
+            unclear = is_unclear(part, trial, self.config)
             if unclear and (left := self._claimed(part, found)) is not None:
                 explained |= members
                 todo = self._taken(part.state, [left.points] if left.pieces else []) + todo
@@ -233,7 +187,7 @@ class PartSearch:
                 continue
             one = Found(part, -trial.cost(part.hypothesis))
             worthy = part.gain > NOISE and one.worth > 0
-            several = self._divided(part, trial, index in self.pieces.apart) if worthy else [part.points]
+            several = several_in(part, trial, self.pieces, index in self.pieces.apart) if worthy else [part.points]
             if len(several) > 1:
                 explained |= members
                 new = self._replaced(min(members), several)

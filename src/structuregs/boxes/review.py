@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -18,6 +18,9 @@ from .hypotheses import displacements, distinct, flips, stack_motions
 from .judge import Trial
 from .pieces import MovingPart, Pieces
 from .refine import just_out_of_sight, measured
+
+_NO_SCRAP = 0.5  # of a part's weight, of the 2 that it could: what explains so much is none, wherever it lies
+_BLURRED = 1.5  # voxels: no nearer is found how a piece moves that does not show in the other state
 
 
 class PartReview:
@@ -168,13 +171,11 @@ class PartReview:
             by_cost = sorted(again, key=trial.cost)
             gaps = displacements(stack_motions(shared), by_cost[0].motion, trial.box)
             losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
-            beside = np.array([self.touch(part, other) for other in others])
             touching = np.array([self._continues(part, other) for other in others])
             alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
-            # What does not show in the other state says little of how it moves, but two pieces do not agree by chance.
-            agree = gaps < self.config.same / np.where(beside, 2, 8)
             lesser = np.array([other.weight >= part.weight for other in others])
-            alike &= (trial.shows(starts[0]) & lesser) | touching | agree
+            shows = trial.shows(starts[0])
+            alike &= (shows & lesser) | touching | self._agree(part, others, gaps, shows)
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
             best_of_its_own = min(h.error + trial.gone_in(h) + h.against(part.weight) for h in again[: -len(shared)])
             needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
@@ -190,6 +191,28 @@ class PartReview:
             parts[index] = replace(part, hypothesis=by_cost[0], rivals=tuple(by_cost[c] for c in chosen[1:]))
             index += 1
         return parts
+
+    def _agree(
+        self, part: MovingPart, others: list[MovingPart], gaps: Float64[np.ndarray, " N"], shows: bool
+    ) -> Bool[np.ndarray, " N"]:
+        """Which other parts a part moves like as nearly as it can be told.
+
+        What does not show in the other state says little of how it moves, but two pieces do not agree by chance.  A small one
+        near a greater, such as a drawer's side, agrees as soon as photos do not tell them apart.
+
+        Args:
+            part: in its best place.
+            others: that it may move like.
+            gaps: between its motion and theirs, over its half diagonal.
+            shows: whether photos of the other state show it.
+        """
+        voxels = np.array([self._voxels_between(part, other) for other in others])
+        agree = gaps < self.config.same / np.where(voxels <= self.config.cue.link, 2, 8)
+        if shows:
+            return agree
+        lesser = np.array([other.weight >= part.weight for other in others])
+        apart = gaps * float(self.pieces.box(part.points).half_extents.norm()) / self.pieces.voxel
+        return agree | (lesser & (voxels <= self.config.cue.link + self.config.clear) & (apart < _BLURRED))
 
     def _shows(self, part: MovingPart, others: list[MovingPart]) -> bool:
         """Whether the photos of the other state show a part, with others in place."""
@@ -214,13 +237,18 @@ class PartReview:
         return float(KDTree(other.points_in(one.state)).query(one.points)[0].min()) / self.pieces.voxel
 
     def _without_pieces(self, parts: list[MovingPart]) -> list[MovingPart]:
-        """The parts, without those that lie within a larger one: what was left over before that one was whole."""
+        """The parts, without those that lie within a larger one's box and explain little: left over before that was whole."""
         kept: list[MovingPart] = []
         for part in sorted(parts, key=lambda part: -len(part.points)):
             within = [self._lying_in(whole, part).double().mean() for whole in kept]
-            if not within or max(within) < 0.6:
+            if not within or max(within) < 0.6 or self._explains(part, [other for other in parts if other is not part]):
                 kept.append(part)
         return kept
+
+    def _explains(self, part: MovingPart, others: list[MovingPart]) -> bool:
+        """Whether a part takes a good share of its weight off both states' photos, with others in place."""
+        trial = self._again(part, others)
+        return trial.explained(trial.judge(part.hypothesis)) > _NO_SCRAP * trial.most
 
     def _lying_in(self, one: MovingPart, other: MovingPart) -> Bool[Tensor, " P"]:
         """Which points of the other part lie in the box of the one, in the state in which the other was found."""
