@@ -841,7 +841,7 @@ class TestReview:
         assert len(review.joined(pieces)) == (1 if continues else 2)
 
     def test_a_small_piece_that_does_not_show_agrees_with_the_part_beside_it_within_what_photos_tell(self):
-        """A corner of the screen that moves 1.2 voxels otherwise: if it is seen, or far off, or heavier, that is another way."""
+        """A corner of the screen moves 1.2 voxels otherwise: seen, or far off, or heavier it has a way of its own."""
         review, right, _ = self.found()
         far = np.linalg.norm(right.points - right.points[right.points[:, 0].argmax()], axis=1)
         small, large = (replace(right, pieces=(right.points[side],)) for side in (far < 0.15, far >= 0.15))
