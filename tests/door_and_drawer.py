@@ -33,14 +33,18 @@ def made_of(*motions: SE3, centres: tuple[tuple[float, float, float], ...] = CEN
     return articulate(PosedParts(boxes, SE3(moves), splats, (120,) * n, torch.zeros(120 * n, 3)))
 
 
-def photographed(obj: ArticulatedObject, views: int = 2) -> Capture:
-    """A capture in memory whose views are the object's own renderings, rounded to bytes."""
-    camera = Camera(SE3.from_quat(torch.tensor([1.0, 0, 0, 0]), torch.tensor([0.0, 0, -4])), 60.0, 60.0, 20.0, 16.0, 40, 32)
+def photographed(obj: ArticulatedObject, views: int = 2, aside: float = 0.0) -> Capture:
+    """A capture in memory whose views, each so far aside of the one before, are the object's own renderings, as bytes."""
     rows = []
     for state in (0, 1):
-        image = render(obj.parts.at_state(state), camera)
-        alpha = (image.alpha > 0.02).byte() * 255
-        rgb = (image.rgb.clamp(0, 1) * 255).round().byte()
-        rgba = torch.cat([torch.where(alpha[..., None] > 0, rgb, 255), alpha[..., None]], -1).numpy()
-        rows.append(tuple(View(f"{i:04d}", camera, rgba) for i in range(views)))
+        row = []
+        for i in range(views):
+            place = SE3.from_quat(torch.tensor([1.0, 0, 0, 0]), torch.tensor([i * aside, 0, -4]))
+            camera = Camera(place, 60.0, 60.0, 20.0, 16.0, 40, 32)
+            image = render(obj.parts.at_state(state), camera)
+            alpha = (image.alpha > 0.02).byte() * 255
+            rgb = (image.rgb.clamp(0, 1) * 255).round().byte()
+            rgba = torch.cat([torch.where(alpha[..., None] > 0, rgb, 255), alpha[..., None]], -1).numpy()
+            row.append(View(f"{i:04d}", camera, rgba))
+        rows.append(tuple(row))
     return Capture("made", Path("made"), (rows[0], rows[1]), (rows[0], rows[1]), "memory")

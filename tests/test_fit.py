@@ -20,10 +20,11 @@ from structuregs.fit.merge import idle_part, moving_alike
 from structuregs.fit.reconstruct import choose_device, finished_object
 from structuregs.fit.run import RunFolder
 from structuregs.fit.schedule import PRESETS, FitConfig, Growth, Rates
+from structuregs.fit.straight import straight_where_loose
 from structuregs.fit.variables import SPLAT_NAMES, Variables, part_index
 from structuregs.geometry import SE3, Box, Screw, quat_to_matrix
 from structuregs.joints import constrain
-from structuregs.model import PosedParts, Splats
+from structuregs.model import ArticulatedObject, PosedParts, Splats
 from structuregs.raster import render
 
 DOOR_AND_DRAWER = made_of(DOOR.motion(), DRAWER.motion()).parts
@@ -551,6 +552,42 @@ class TestAskew:
         before = float(askew(parts, ["revolute", "prismatic"]))
         list(fit.run(40))
         assert float(askew(fit.state.variables.parts().detach(), ["revolute", "prismatic"])) < 0.2 * before
+
+
+class TestStraight:
+    """A drawer that comes out towards -y, photographed along z from places a little aside of each other."""
+
+    @staticmethod
+    def drawn(way: tuple[float, float, float], seen: tuple[float, float, float]) -> ArticulatedObject:
+        """An object whose drawer was fitted to go one way, drawn straight by photos that saw it go another."""
+        fitted, true = (made_of(DOOR.motion(), SE3.from_quat(SE3.identity().wxyz, torch.tensor(t))) for t in (way, seen))
+        return straight_where_loose(fitted, photographed(true, views=6, aside=0.1))
+
+    def test_a_slide_that_photos_do_not_tell_from_a_straight_one_is_straight(self):
+        obj = self.drawn((0.0, -0.4, 0.004), (0.0, -0.4, 0.0))
+        assert obj.joints[1].axis == pytest.approx((0.0, -1.0, 0.0), abs=1e-7)
+        assert obj.joints[1].q == pytest.approx((0.0, 0.4), abs=1e-4)
+        same_motion(obj.parts.motions[2], obj.joints[1].motion(obj.joints[1].q[1]))
+        same_motion(obj.parts.motions[1], DOOR.motion())
+
+    def test_one_that_is_truly_askew_stays_as_it_is(self):
+        askew_way = (0.04, -0.4, 0.0)
+        obj = self.drawn(askew_way, askew_way)
+        assert obj.joints[1].axis == pytest.approx(tuple(np.array(askew_way) / np.linalg.norm(askew_way)), abs=1e-5)
+
+    def test_a_hinge_is_drawn_about_the_point_that_is_nearest_to_its_part(self):
+        leaning = replace(DOOR, axis=(0.0, math.sin(0.004), math.cos(0.004)), origin=(1.0, 0.0, 0.3)).motion()
+        fitted, true = made_of(leaning), made_of(DOOR.motion())
+        before = fitted.joints[0]
+        (joint,) = straight_where_loose(fitted, photographed(true, views=6, aside=0.1)).joints
+        assert joint.axis == pytest.approx((0.0, 0.0, 1.0), abs=1e-7)
+        assert joint.origin == pytest.approx(before.origin, abs=1e-6)
+        assert joint.q[1] == pytest.approx(before.q[1], abs=1e-4)
+        assert joint.confidence == before.confidence
+
+    def test_what_has_no_joints_is_left_alone(self):
+        still = made_of()
+        assert straight_where_loose(still, photographed(still)) is still
 
 
 def two_pieces(gap: float, **second: float) -> PosedParts:

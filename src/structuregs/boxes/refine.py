@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Int64
 from scipy.optimize import minimize_scalar
 
-from ..geometry import SE3, Box, Screw, screw_at
+from ..geometry import SE3, Box, Screw, screw_at, straightened
 from ..joints import kind_of
 from .hypotheses import Hypothesis, turn_about
 from .judge import NOISE, Trial
@@ -155,12 +155,3 @@ def shortest_out_of_sight(trial: Trial, base: Box) -> SE3 | None:
             if trial.out_of_sight(motion):
                 return motion
     return None
-
-
-def straightened(screw: Screw, q: float, box: Box) -> tuple[Screw, float]:
-    """The screw along the nearest axis of a box, the same way, and as much of `q` as goes along it."""
-    axes = box.T_world_box.rotation.T
-    along = axes @ screw.axis
-    nearest = int(along.abs().argmax())
-    straight = replace(screw, axis=axes[nearest] * along[nearest].sign())
-    return straight, q * float(straight.axis @ screw.axis)

@@ -4,14 +4,13 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from ..geometry import SE3, Screw, screw_at
+from ..geometry import SE3, Screw, screw_at, straightened
 from ..joints import kind_of
 from .config import SearchConfig
 from .cue import Points
 from .divide import FACTORS, cut_across, divide, nearest_of
 from .judge import Trial
 from .pieces import MovingPart, Pieces
-from .refine import straightened
 
 _ALIGNED = 0.9998  # cosine between two axes: a degree
 

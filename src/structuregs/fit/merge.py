@@ -42,20 +42,20 @@ def idle_part(parts: PosedParts, photos: ImageStack) -> int | None:
         photos: of state 1.
     """
     asked = spread_cameras(photos.cameras, _VIEWS)
-    moving = _errors(parts, photos, asked)
+    moving = colour_errors(parts, photos, asked)
     needs = {}
     for k in range(1, len(parts)):
         motions = parts.motions.wxyz_xyz.clone()
         motions[k] = motions[0]
-        lost = _errors(replace(parts, motions=SE3(motions)), photos, asked) - moving
+        lost = colour_errors(replace(parts, motions=SE3(motions)), photos, asked) - moving
         needed = max(2 * lost.std() / np.sqrt(max(len(lost) - 1, 1)), _WORTH * moving.mean())
         if lost.mean() < needed:
             needs[k] = float(lost.mean())
     return min(needs, key=needs.__getitem__) if needs else None
 
 
-def _errors(parts: PosedParts, photos: ImageStack, asked: list[int]) -> Float64[np.ndarray, " V"]:
-    """Mean absolute colour difference of each photo asked."""
+def colour_errors(parts: PosedParts, photos: ImageStack, asked: list[int]) -> Float64[np.ndarray, " V"]:
+    """Mean absolute colour difference of each photo of state 1 that is asked."""
     splats = parts.at_state(1)
     pictures = [(render(splats, photos.cameras[v]).rgb, photos.target(int(v))[0]) for v in asked]
     return np.array([float((drawn.cpu() - photo).abs().mean()) for drawn, photo in pictures])

@@ -22,6 +22,7 @@ from .evidence import alike_in_both, covered_in_both, seen_in_both
 from .loop import FitState, Fitter
 from .run import Clock, RunFolder
 from .schedule import PRESETS, FitConfig
+from .straight import straight_where_loose
 
 _PREVIEW_EVERY = 50  # steps
 _ANEW = 0.35  # of the fit: by then cameras that are turned are nearly right, and all begins anew with them
@@ -164,6 +165,8 @@ def fit_run(
         folder.keep_cameras(fitter.state.offset.detach(), fitter.state.turns, capture)
     photos = folder.put_right(capture)
     obj = finished_object(fitter.state)
+    if config.along_base:
+        obj = straight_where_loose(obj, photos)
     for evidence in (seen_in_both, covered_in_both, alike_in_both):
         obj = evidence(obj, photos)
     save_object(obj, folder.object)

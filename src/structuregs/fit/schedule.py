@@ -116,7 +116,8 @@ class FitConfig:
     planarity_size: int = 160
     """Size of the images that it is taken from: the side of a square with as many pixels."""
     along_base: float = 1.0
-    """Of the squared sine of the angle between a joint's axis and the nearest one of the base's box, where that is small."""
+    """Of the squared sine of the angle between a joint's axis and the nearest one of the base's box, where that is small.  At
+    the end joints that photos do not tell from ones along the base go along it.  0 for neither."""
     square_at: tuple[float, ...] = (0.35, 0.6)
     """Parts of the fit after which boxes are turned along the faces of their parts, and drawn out where splats press on."""
     join_at: float = 0.35

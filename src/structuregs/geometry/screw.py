@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .box import Box
 from .se3 import SE3
 
 JointKind = Literal["revolute", "prismatic"]
@@ -74,3 +75,12 @@ def screw_at(motion: SE3, kind: JointKind, centre: Float[Tensor, " 3"]) -> tuple
     at_centre = SE3.from_quat(motion.wxyz, motion.apply(centre) - centre)
     screw, q = screw_of_motion(at_centre, kind)
     return replace(screw, origin=screw.origin + centre), q
+
+
+def straightened(screw: Screw, q: float, box: Box) -> tuple[Screw, float]:
+    """The screw along the nearest axis of a box, the same way, and as much of `q` as goes along it."""
+    axes = box.T_world_box.rotation.T
+    along = axes @ screw.axis
+    nearest = int(along.abs().argmax())
+    straight = replace(screw, axis=axes[nearest] * along[nearest].sign())
+    return straight, q * float(straight.axis @ screw.axis)
