@@ -43,11 +43,10 @@ class PartReview:
         while index < len(parts):
             part, others = parts[index], parts[:index] + parts[index + 1 :]
             within = [self._lying_in(other, part) for other in others]
-            if others and float(torch.stack(within).any(0).double().mean()) > 0.6:
-                trial = self._again(part, others)
-                if trial.explained(trial.judge(part.hypothesis)) < 0:
-                    parts, index = others, 0
-                    continue
+            lies_there = others and float(torch.stack(within).any(0).double().mean()) > 0.6
+            if lies_there and self._explained(part, others) < 0:
+                parts, index = others, 0
+                continue
             index += 1
         return parts
 
@@ -241,14 +240,15 @@ class PartReview:
         kept: list[MovingPart] = []
         for part in sorted(parts, key=lambda part: -len(part.points)):
             within = [self._lying_in(whole, part).double().mean() for whole in kept]
-            if not within or max(within) < 0.6 or self._explains(part, [other for other in parts if other is not part]):
+            others = [other for other in parts if other is not part]
+            if not within or max(within) < 0.6 or self._explained(part, others) > _NO_SCRAP * part.weight:
                 kept.append(part)
         return kept
 
-    def _explains(self, part: MovingPart, others: list[MovingPart]) -> bool:
-        """Whether a part takes a good share of its weight off both states' photos, with others in place."""
+    def _explained(self, part: MovingPart, others: list[MovingPart]) -> float:
+        """What a part takes off the errors of both states' photos, with others in place."""
         trial = self._again(part, others)
-        return trial.explained(trial.judge(part.hypothesis)) > _NO_SCRAP * trial.most
+        return trial.explained(trial.judge(part.hypothesis))
 
     def _lying_in(self, one: MovingPart, other: MovingPart) -> Bool[Tensor, " P"]:
         """Which points of the other part lie in the box of the one, in the state in which the other was found."""

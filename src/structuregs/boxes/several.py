@@ -44,7 +44,9 @@ def several_in(part: MovingPart, trial: Trial, pieces: Pieces, known_cut: bool) 
     best = max((division for division in divisions if len(division[0]) > 1), key=lambda division: division[1], default=None)
     if best is not None:
         return best[0]
-    for way, support in zip([] if known_cut else ways, supports, strict=False):
+    if known_cut:
+        return [part.points]
+    for way, support in zip(ways, supports, strict=False):  # not along what rivals add
         cut = _cut(part, trial, pieces, way, support)
         if len(cut) > 1:
             return cut

@@ -1,13 +1,10 @@
 """Parts that are none: two that are one, and what needs no motion."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from jaxtyping import Float64
 
 from ..capture import ImageStack, spread_cameras
-from ..geometry import SE3
 from ..model import PosedParts
 from ..raster import render
 from .structure import contact_loss
@@ -45,10 +42,8 @@ def idle_part(parts: PosedParts, photos: ImageStack) -> int | None:
     moving = colour_errors(parts, photos, asked)
     needs = {}
     for k in range(1, len(parts)):
-        motions = parts.motions.wxyz_xyz.clone()
-        motions[k] = motions[0]
-        lost = colour_errors(replace(parts, motions=SE3(motions)), photos, asked) - moving
-        needed = max(2 * lost.std() / np.sqrt(max(len(lost) - 1, 1)), _WORTH * moving.mean())
+        lost = colour_errors(parts.with_motion(k, parts.motions[0]), photos, asked) - moving
+        needed = max(2 * standard_error(lost), _WORTH * moving.mean())
         if lost.mean() < needed:
             needs[k] = float(lost.mean())
     return min(needs, key=needs.__getitem__) if needs else None
@@ -59,3 +54,8 @@ def colour_errors(parts: PosedParts, photos: ImageStack, asked: list[int]) -> Fl
     splats = parts.at_state(1)
     pictures = [(render(splats, photos.cameras[v]).rgb, photos.target(int(v))[0]) for v in asked]
     return np.array([float((drawn.cpu() - photo).abs().mean()) for drawn, photo in pictures])
+
+
+def standard_error(values: Float64[np.ndarray, " V"]) -> float:
+    """Of the mean of values; of one alone, 0."""
+    return float(values.std() / np.sqrt(max(len(values) - 1, 1)))

@@ -2,13 +2,12 @@
 
 from dataclasses import replace
 
-import numpy as np
 import torch
 
 from ..capture import Capture, spread_cameras, stack_views
-from ..geometry import SE3, screw_at, straightened
+from ..geometry import screw_at, straightened
 from ..model import ArticulatedObject
-from .merge import colour_errors
+from .merge import colour_errors, standard_error
 
 _SIZE = 800  # side of a square with as many pixels as the photos that are asked; never more than they have
 _PHOTOS = 24
@@ -37,12 +36,10 @@ def straight_where_loose(obj: ArticulatedObject, capture: Capture) -> Articulate
     own = colour_errors(parts, stack, asked)
     for k, joint in enumerate(joints, start=1):
         screw, q = straightened(*screw_at(parts.motions[k], joint.kind, centres[k]), base)
-        motions = parts.motions.wxyz_xyz.clone()
-        motions[k] = screw.motion(q).wxyz_xyz
-        straight = replace(parts, motions=SE3(motions))
+        straight = parts.with_motion(k, screw.motion(q))
         errors = colour_errors(straight, stack, asked)
         lost = errors - own
-        if lost.mean() < min(_CLEAR * lost.std() / np.sqrt(max(len(lost) - 1, 1)), _TOLD * own.mean()):
+        if lost.mean() < min(_CLEAR * standard_error(lost), _TOLD * own.mean()):
             parts, own = straight, errors
             joints[k - 1] = replace(joint, axis=tuple(screw.axis.tolist()), origin=tuple(screw.origin.tolist()), q=(0.0, q))
     return replace(obj, parts=parts, joints=tuple(joints))

@@ -96,6 +96,12 @@ class PosedParts:
         counts = tuple(self.counts[k] + (self.counts[b] if k == a else 0) for k in kept)
         return PosedParts(both.boxes[kept], self.motions[kept], both.splats[order], counts, self.tint[order])
 
+    def with_motion(self, k: int, motion: SE3) -> "PosedParts":
+        """The same with another motion of part k."""
+        motions = self.motions.wxyz_xyz.clone()
+        motions[k] = motion.wxyz_xyz
+        return replace(self, motions=SE3(motions))
+
     def in_box(self, k: int, box: Box) -> "PosedParts":
         """The same splats with another box around part k, in state 0."""
         turn = quat_multiply(box.T_world_box.inverse().wxyz, self.boxes.T_world_box.wxyz[k])
