@@ -554,6 +554,17 @@ class TestParts:
         assert found.error < start.error
         assert found.oddity == pytest.approx(oddity(found.motion, screen, trial.there.still), abs=1e-6)
 
+    def test_a_part_that_shows_more_in_the_other_state_is_pulled_all_the_way(self):
+        """What it explains there beyond its weight says as well where it is: what is less odd, but not in place, is worse."""
+        obj, looks = looks_of("laptop")
+        (true,) = obj.joints
+        screw, q = screw_at(true.motion(), "revolute", trial_of_screen().box.T_world_box.xyz)
+        trial = replace(trial_of_screen(), most=0.001)
+        start = trial.judge(Hypothesis(screw.motion(q - 0.1), 0.0, 0.0, 0.0))
+        pulled = Pieces(looks, SMALL.search, seed=0).pulled(start, trial, 60)
+        assert trial.explained(start) == trial.explained(pulled) == pytest.approx(0.002)
+        assert errors(pulled.motion, trial.box.corners.numpy(), true)[0] < 1.5
+
     @pytest.mark.parametrize("degrees", [5.0, 30.0])
     def test_a_slide_that_photos_leave_loose_runs_along_an_axis(self, degrees: float):
         angle = np.deg2rad(degrees)

@@ -262,6 +262,14 @@ class Trial:
         """What hypotheses are compared by: what speaks against them, less what they explain."""
         return hypothesis.against(self.weight) + self.gone_in(hypothesis) - self.explained(hypothesis, quick)
 
+    def burden(self, hypothesis: Hypothesis) -> float:
+        """What motions near each other are compared by: what speaks against them, and all of the photos' error.
+
+        How much a part shows differs between the states' photos, the more so the fewer they are; what it takes off beyond its
+        weight says nothing of where it is, but all of how exactly it lies there.
+        """
+        return hypothesis.against(self.weight) + self.gone_in(hypothesis) + hypothesis.error
+
     def gain(self, hypothesis: Hypothesis) -> float:
         """Fraction that the part takes off the error of both states' photos."""
         return (self.absent - hypothesis.error) / self.absent

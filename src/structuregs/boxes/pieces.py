@@ -193,9 +193,9 @@ class Pieces:
         """
         refined = refine(start, trial, steps, self.config.rate)
         if trial.shows(refined):
-            return min(simplest(refined, trial, self.base_box, self.config.plain), start, key=trial.cost)
+            return min(simplest(refined, trial, self.base_box, self.config.plain), start, key=trial.burden)
         refined = simplest(refined, trial, self.base_box, self.config.plain_if_shut)
-        return min((along_base(h, trial, self.base_box) for h in (refined, start)), key=trial.cost)
+        return min((along_base(h, trial, self.base_box) for h in (refined, start)), key=trial.burden)
 
     def sample(self, points: Float64[np.ndarray, "P 3"], most: int) -> Float64[np.ndarray, "Q 3"]:
         """At most so many of the points, drawn by chance."""

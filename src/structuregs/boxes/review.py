@@ -176,7 +176,7 @@ class PartReview:
             shows = trial.shows(starts[0])
             alike &= (shows & lesser) | touching | self._agree(part, others, gaps, shows)
             # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
-            best_of_its_own = min(h.error + trial.gone_in(h) + h.against(part.weight) for h in again[: -len(shared)])
+            best_of_its_own = min(map(trial.burden, again[: -len(shared)]))
             needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
             alike |= needless & touching & lesser
 
