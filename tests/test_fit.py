@@ -310,7 +310,7 @@ QUICK = FitConfig(
 )
 
 
-CONSTANT = Rates(means_final=1.0, poses_final=1.0, appearance_final=1.0)
+CONSTANT = Rates(means_final=1.0, motions_final=1.0, poses_final=1.0, appearance_final=1.0)
 # The preset without stages in which some rates wait for others.
 PLAIN = replace(PRESETS["paper"], image_from=0, structure_size=24, one_joint_from=1.0)
 
@@ -412,12 +412,11 @@ class TestOptimiser:
         fit._adam()
         torch.testing.assert_close(before - leaf.detach(), torch.full_like(leaf, Rates().sh), rtol=1e-3, atol=1e-8)
 
-    @pytest.mark.parametrize(("name", "final"), [("means", 0.02), ("motions", 0.04), ("box_centres", 0.04), ("sh", 0.2)])
+    @pytest.mark.parametrize(("name", "final"), [("means", 0.02), ("motions", 0.03), ("box_centres", 0.04), ("sh", 0.2)])
     def test_rates_fall_by_a_constant_factor_a_step(self, name: str, final: float):
         """Under a constant gradient Adam's step is the rate."""
-        config = replace(
-            PLAIN, steps=10, structure_until=10, rates=Rates(means_final=0.02, poses_final=0.04, appearance_final=0.2)
-        )
+        rates = Rates(means_final=0.02, motions_final=0.03, poses_final=0.04, appearance_final=0.2)
+        config = replace(PLAIN, steps=10, structure_until=10, rates=rates)
         fit = fitter(config)
         leaf = fit.state.variables.leaves[name]
         rate = getattr(config.rates, name, config.rates.boxes)

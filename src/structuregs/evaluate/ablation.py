@@ -24,7 +24,10 @@ def ablations(capture: Capture, config: FitConfig, folder: Path, seed: int) -> l
         ),
         "no_ssim": ("no SSIM", replace(config, ssim_weights=((0.0, 0.0),))),
         "ssim_of_3dgs": ("SSIM's share as in 3DGS from the start", replace(config, ssim_weights=((0.0, 0.2),))),
-        "steady_poses": ("rates of poses that do not fall", replace(config, rates=replace(config.rates, poses_final=1.0))),
+        "steady_poses": (
+            "rates of poses that do not fall",
+            replace(config, rates=replace(config.rates, motions_final=1.0, poses_final=1.0)),
+        ),
         "half_size": ("photos of half the size", replace(config, sizes=tuple((at, size // 2) for at, size in config.sizes))),
         "full_size": ("photos of the last size from the start", replace(config, sizes=((0.0, last),))),
         "eager_motions": ("motions move as soon as photos are compared", replace(config, motions_from=0.0)),

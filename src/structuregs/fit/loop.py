@@ -341,7 +341,7 @@ class Fitter:
             return 0.0
         if name == "principal_point" and self.state.turns is not None:  # turns put every photo right by itself
             return 0.0
-        finals = {"means": rates.means_final} | dict.fromkeys(_POSE_NAMES, rates.poses_final)
+        finals = {"means": rates.means_final, "motions": rates.motions_final, "principal_point": rates.poses_final}
         final = finals.get(name, rates.appearance_final)
         return getattr(rates, name) * final**done
 
