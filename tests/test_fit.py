@@ -440,7 +440,7 @@ class TestOptimiser:
     def test_a_fit_to_its_own_pictures_brings_a_wrong_motion_back(self):
         off = SE3.exp(torch.tensor([[0.0] * 6, [0.02, -0.02, 0.01, 0.0, 0.03, -0.06], [0.0] * 6]))
         parts = replace(DOOR_AND_DRAWER, motions=off @ DOOR_AND_DRAWER.motions)
-        still = Rates(*[0.0] * 7, motions=1e-2)
+        still = Rates(*[0.0] * 7, motions=1e-2, motions_final=0.1)
         growth = Growth(interval=1000)
         now = replace(QUICK, image_from=0, structure_until=0, motions_from=0.0)
         config = replace(now, steps=150, one_joint_from=1.0, rates=still, growth=growth, alpha_weight=0.0, give_way=0.0)
