@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from structuregs.capture import Capture, View, stack_views
-from structuregs.fit.evidence import covered_in_both, seen_in_both, shown
+from structuregs.fit.evidence import covered_in_both, outlined_in_both, seen_in_both, shown
 from structuregs.geometry import SE3, Box, Camera
 from structuregs.joints import REVIEW_BELOW, articulate
 from structuregs.model import ArticulatedObject, PosedParts, Splats
@@ -132,6 +132,18 @@ def test_a_part_is_doubted_where_photos_beside_it_show_what_nothing_covers():
     assert short[0].confidence == 1
     assert short[1].confidence < 0.5
     assert short[1].review.startswith("Beside the part, photos of state 1 show what nothing covers (")
+
+
+def test_a_part_is_doubted_whose_outline_is_not_that_of_the_masks():
+    """Half a pixel short: nothing is left uncovered."""
+    photos = photographed(two_balls(0.7, 0.6))
+    right, short = outlined_in_both(two_balls(0.7, 0.6), photos).joints, outlined_in_both(two_balls(0.7, 0.58), photos).joints
+    assert [joint.confidence for joint in right] == [1, 1]
+    assert [joint.review for joint in right] == ["", ""]
+    assert short[0].confidence == 1
+    assert short[1].confidence < 0.5
+    assert short[1].review.startswith("Where the part lies in state 1, its outline is not the masks' (by ")
+    assert covered_in_both(two_balls(0.7, 0.58), photos).joints[1].confidence == 1
 
 
 def test_what_some_splats_cover_and_what_the_others_do_adds_up_to_the_picture_s_coverage(capture: Capture):

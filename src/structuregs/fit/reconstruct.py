@@ -18,7 +18,7 @@ from ..model import ArticulatedObject, PosedParts, load_object, save_object
 from ..points import points_from
 from .boxes import object_size, tightened
 from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
-from .evidence import alike_in_both, covered_in_both, seen_in_both
+from .evidence import alike_in_both, covered_in_both, outlined_in_both, seen_in_both
 from .loop import FitState, Fitter
 from .run import Clock, RunFolder
 from .schedule import PRESETS, FitConfig
@@ -167,7 +167,7 @@ def fit_run(
     obj = finished_object(fitter.state)
     if config.along_base:
         obj = straight_where_loose(obj, photos)
-    for evidence in (seen_in_both, covered_in_both, alike_in_both):
+    for evidence in (seen_in_both, covered_in_both, outlined_in_both, alike_in_both):
         obj = evidence(obj, photos)
     save_object(obj, folder.object)
     clock.save()
