@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from structuregs.capture import Capture, View, stack_views
-from structuregs.fit.evidence import covered_in_both, outlined_in_both, seen_in_both, shown
+from structuregs.fit.evidence import alike_in_both, covered_in_both, outlined_in_both, seen_in_both, shown
 from structuregs.geometry import SE3, Box, Camera
 from structuregs.joints import REVIEW_BELOW, articulate
 from structuregs.model import ArticulatedObject, PosedParts, Splats
@@ -144,6 +144,15 @@ def test_a_part_is_doubted_whose_outline_is_not_that_of_the_masks():
     assert short[1].confidence < 0.5
     assert short[1].review.startswith("Where the part lies in state 1, its outline is not the masks' (by ")
     assert covered_in_both(two_balls(0.7, 0.58), photos).joints[1].confidence == 1
+
+
+def test_what_has_no_joint_is_not_doubted():
+    """Photos show two balls, the object has none."""
+    photos, obj = photographed(two_balls(0.7, 0.6)), two_balls(0.7, 0.6)
+    still = articulate(obj.parts.joined(0, 1).joined(0, 1))
+    assert still.joints == ()
+    for evidence in (seen_in_both, covered_in_both, outlined_in_both, alike_in_both):
+        assert evidence(still, photos).joints == ()
 
 
 def test_what_some_splats_cover_and_what_the_others_do_adds_up_to_the_picture_s_coverage(capture: Capture):

@@ -99,6 +99,8 @@ def covered_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObje
         obj: as fitted.
         capture: what it was fitted to.
     """
+    if not obj.joints:
+        return obj
     parts = obj.parts.to(torch.device("cpu"))
     bare = np.zeros((2, len(parts)))
     for state, views in enumerate(capture.train):
@@ -137,6 +139,8 @@ def outlined_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObj
         obj: as fitted.
         capture: what it was fitted to.
     """
+    if not obj.joints:
+        return obj
     parts = obj.parts.to(torch.device("cpu"))
     off, own = np.zeros((2, len(parts))), np.zeros((2, len(parts)))
     for state, views in enumerate(capture.train):
