@@ -1,11 +1,11 @@
-"""What the photos say of a fit: splats that none shows, what none covers, and parts that both states show, and alike."""
+"""What the photos say of a fit: splats that none shows, what nothing covers, outlines, and parts that both show, and alike."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy import ndimage
 from torch import Tensor
 
@@ -22,7 +22,7 @@ _PHOTOS = 16  # of either state
 _ENOUGH = 0.2  # of what a part that slides shows in one state: as much in the other leaves nothing to wish for; ...
 _ENOUGH_TURNED = 0.35  # ...of one that turns, whose rim alone does not say about which hinge
 _TRACE = 2e-6  # of a photo: a splat that paints less in all of them is not missed
-_EMPTY = 0.5  # a pixel's coverage by the model is at least so much less than the object's where nothing shows it
+_EMPTY = 0.5  # of a pixel: what covers more covers it, and mask and model that differ by more see it differently
 _GAPS, _HOLE = 0.005, 0.08  # of what photos show: nothing to say of so much uncovered; as much more leaves no confidence
 _RIM, _BESIDE = 0.003, 0.012  # of the pixels that a part covers: the same of pixels that masks and model see differently
 _LOOK = 400  # side of a square with as many pixels as the pictures that tell
@@ -102,27 +102,15 @@ def covered_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObje
     if not obj.joints:
         return obj
     parts = obj.parts.to(torch.device("cpu"))
-    bare = np.zeros((2, len(parts)))
-    for state, views in enumerate(capture.train):
-        stack, splats = stack_views(views, _SIZE), parts.at_state(state)
-        asked = spread_cameras(stack.cameras, _PHOTOS)
-        for v in asked:
-            shown, alpha = stack.target(v)[1].numpy(), render(splats, stack.cameras[v]).alpha.numpy()
-            empty = shown - alpha > _EMPTY
-            if not empty.any():
-                continue
-            nearest = 1 + _away(_silhouettes(parts, splats, stack.cameras[v])[1:]).argmin(0)
-            bare[state] += np.bincount(nearest[empty], minlength=len(parts)) / (shown.sum() * len(asked))
-    worst, state = bare.max(0), bare.argmax(0)
-    joints = [
-        _lowered(
-            joint,
-            float(np.clip(1 - (worst[k] - _GAPS) / _HOLE, 0, 1)),
-            f"Beside the part, photos of state {state[k]} show what nothing covers ({worst[k]:.0%} of the object).",
-        )
-        for k, joint in enumerate(obj.joints, start=1)
-    ]
-    return replace(obj, joints=tuple(joints))
+    bare, photos = np.zeros((2, len(parts))), np.zeros((2, 1))
+    for state, splats, camera, covered, alpha in _masks_and_model(parts, capture, _SIZE):
+        photos[state] += 1
+        empty = covered - alpha > _EMPTY
+        if empty.any():
+            nearest = 1 + _nearest(_silhouettes(parts, splats, camera)[1:])
+            bare[state] += np.bincount(nearest[empty], minlength=len(parts)) / covered.sum()
+    sentence = "Beside the part, photos of state {state} show what nothing covers ({share:.0%} of the object)."
+    return _doubted(obj, bare / photos, _GAPS, _HOLE, sentence)
 
 
 @torch.no_grad()
@@ -143,26 +131,25 @@ def outlined_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObj
         return obj
     parts = obj.parts.to(torch.device("cpu"))
     off, own = np.zeros((2, len(parts))), np.zeros((2, len(parts)))
+    for state, splats, camera, covered, alpha in _masks_and_model(parts, capture, _LOOK):
+        silhouettes = _silhouettes(parts, splats, camera)
+        own[state] += silhouettes.sum((1, 2))
+        wrong = np.abs(covered - alpha) > _EMPTY
+        if wrong.any():
+            off[state] += np.bincount(_nearest(silhouettes)[wrong], minlength=len(parts))
+    sentence = "Where the part lies in state {state}, its outline is not the masks' (by {share:.1%} of what it covers)."
+    return _doubted(obj, off / np.maximum(own, 1), _RIM, _BESIDE, sentence)
+
+
+def _masks_and_model(
+    parts: PosedParts, capture: Capture, size: int
+) -> Iterator[tuple[int, Splats, Camera, Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]]:
+    """Of some photos: their state, the splats as they stand in it, the camera, the mask, and how the splats cover it."""
     for state, views in enumerate(capture.train):
-        stack, splats = stack_views(views, _LOOK), parts.at_state(state)
+        stack, splats = stack_views(views, size), parts.at_state(state)
         for v in spread_cameras(stack.cameras, _PHOTOS):
-            silhouettes = _silhouettes(parts, splats, stack.cameras[v])
-            own[state] += silhouettes.sum((1, 2))
-            shown, alpha = stack.target(v)[1].numpy(), render(splats, stack.cameras[v]).alpha.numpy()
-            wrong = np.abs(shown - alpha) > _EMPTY
-            if wrong.any():
-                off[state] += np.bincount(_away(silhouettes).argmin(0)[wrong], minlength=len(parts))
-    shares = off / np.maximum(own, 1)
-    worst, state = shares.max(0), shares.argmax(0)
-    joints = [
-        _lowered(
-            joint,
-            float(np.clip(1 - (worst[k] - _RIM) / _BESIDE, 0, 1)),
-            f"Where the part lies in state {state[k]}, its outline is not the masks' (by {worst[k]:.1%} of what it covers).",
-        )
-        for k, joint in enumerate(obj.joints, start=1)
-    ]
-    return replace(obj, joints=tuple(joints))
+            camera = stack.cameras[v]
+            yield state, splats, camera, stack.target(v)[1].numpy(), render(splats, camera).alpha.numpy()
 
 
 def _silhouettes(parts: PosedParts, splats: Splats, camera: Camera) -> Bool[np.ndarray, "K H W"]:
@@ -170,12 +157,36 @@ def _silhouettes(parts: PosedParts, splats: Splats, camera: Camera) -> Bool[np.n
     return np.stack([coverage_of(splats, parts.part == k, camera).numpy() > _EMPTY for k in range(len(parts))])
 
 
-def _away(silhouettes: Bool[np.ndarray, "K H W"]) -> Float64[np.ndarray, "K H W"]:
-    """How many pixels away from each silhouette every pixel lies; farther than all others where there is none."""
-    none = float(silhouettes[0].size)
-    return np.stack(
-        [np.asarray(ndimage.distance_transform_edt(~own)) if own.any() else np.full(own.shape, none) for own in silhouettes]
-    )
+def _nearest(silhouettes: Bool[np.ndarray, "K H W"]) -> Int64[np.ndarray, "H W"]:
+    """The silhouette that is nearest to each pixel."""
+    none = float(silhouettes[0].size)  # farther than anything
+    away = [np.asarray(ndimage.distance_transform_edt(~own)) if own.any() else np.full(own.shape, none) for own in silhouettes]
+    return np.argmin(away, 0)
+
+
+def _doubted(
+    obj: ArticulatedObject, shares: Float64[np.ndarray, "2 K"], least: float, more: float, sentence: str
+) -> ArticulatedObject:
+    """The object with the confidence of its joints lowered by what speaks against their parts in the worse state.
+
+    Args:
+        obj: as fitted.
+        shares: of either state and each part, what speaks against it.
+        least: nothing to say of so much.
+        more: no confidence is left with so much more.
+        sentence: where that makes a joint doubtful, with the fields `state` and `share`.
+    """
+    worst, state = shares.max(0), shares.argmax(0)
+    joints = [
+        _lowered(joint, _score(worst[k], least, more), sentence.format(state=state[k], share=worst[k]))
+        for k, joint in enumerate(obj.joints, start=1)
+    ]
+    return replace(obj, joints=tuple(joints))
+
+
+def _score(value: float, least: float, more: float) -> float:
+    """1 up to the least, and from there down to 0 where the value is so much more."""
+    return float(np.clip(1 - (value - least) / more, 0, 1))
 
 
 @torch.no_grad()
@@ -207,9 +218,9 @@ def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject
             Overlap.between(second, first, motion.inverse(), boxes[k].moved(motion), unit),
         )
         left = [overlap.unlike() for overlap in laid if len(overlap) > _FEWEST]
-        score = 1 - (max(left, default=0.0) - 1) / _NOTHING
+        score = _score(max(left, default=0.0), 1.0, _NOTHING)
         sentence = "Where the part lies in either state, photos of the two do not look alike."
-        joints.append(_lowered(joint, min(max(score, 0.0), 1.0), sentence))
+        joints.append(_lowered(joint, score, sentence))
     return replace(obj, joints=tuple(joints))
 
 
