@@ -11,6 +11,7 @@ from structuregs.boxes import Face, Overlap, Shown
 from structuregs.boxes.appearance import LOOK_DILATION
 from structuregs.capture import Capture, ImageStack, View
 from structuregs.fit.evidence import alike_in_both
+from structuregs.fit.laying import laid_anew
 from structuregs.geometry import SE3, Box, Camera
 from structuregs.joints import articulate
 from structuregs.model import SH_C0, ArticulatedObject, PosedParts, Splats
@@ -159,15 +160,15 @@ def test_where_the_part_is_not_known_all_that_is_seen_may_be_it():
     assert len(unknown) > len(known) > 0.8 * len(unknown)
 
 
-def with_a_base(motion: SE3) -> ArticulatedObject:
+def with_a_base(motion: SE3, pattern: np.ndarray = CHECKS) -> ArticulatedObject:
     """The board as the moving part of an object whose base is a plain block beside it."""
     block = board(PLAIN)
     block = replace(block, means=block.means * 0.3 + torch.tensor([0.0, 1.0, 0.0]))
     poses = torch.tensor([[1.0, 0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 0, 0]])
     boxes = Box(SE3(poses), torch.tensor([[0.6, 0.4, 0.4], [0.6, 0.4, 0.02]]))
     motions = SE3(torch.stack([SE3.identity().wxyz_xyz, motion.wxyz_xyz.float()]))
-    counts = (len(block), len(board(CHECKS)))
-    splats = Splats.concatenate([block, board(CHECKS)])
+    counts = (len(block), len(board(pattern)))
+    splats = Splats.concatenate([block, board(pattern)])
     part = torch.arange(2).repeat_interleave(torch.tensor(counts))
     local = replace(splats, means=(splats.means - poses[part, 4:]) / boxes.half_extents[part])
     return articulate(PosedParts(boxes, motions, local, counts, torch.zeros(sum(counts), 3)))
@@ -178,14 +179,19 @@ def slide(aside: float) -> SE3:
     return SE3.exp(torch.tensor([aside, 0, 0.5, 0, 0, 0], dtype=F64))
 
 
-def test_a_part_whose_photos_are_not_alike_asks_for_a_look():
-    true = with_a_base(slide(0.0))
+def photographed(obj: ArticulatedObject) -> Capture:
+    """Both states, from all cameras."""
     rows = []
     for state in (0, 1):
-        pictures = [render(true.parts.at_state(state), camera, dilation=LOOK_DILATION) for camera in cameras()]
+        pictures = [render(obj.parts.at_state(state), camera, dilation=LOOK_DILATION) for camera in cameras()]
         rgba = [torch.cat([p.rgb, p.alpha[..., None]], -1).clamp(0, 1).mul(255).round().byte().numpy() for p in pictures]
         rows.append(tuple(View(f"{i}", camera, image) for i, (camera, image) in enumerate(zip(cameras(), rgba, strict=True))))
-    capture = Capture("board", Path("board"), (rows[0], rows[1]), (rows[0], rows[1]), "memory")
+    return Capture("board", Path("board"), (rows[0], rows[1]), (rows[0], rows[1]), "memory")
+
+
+def test_a_part_whose_photos_are_not_alike_asks_for_a_look():
+    true = with_a_base(slide(0.0))
+    capture = photographed(true)
     (joint,) = alike_in_both(true, capture).joints
     assert joint == true.joints[0]
     assert joint.review == ""
@@ -193,3 +199,16 @@ def test_a_part_whose_photos_are_not_alike_asks_for_a_look():
     (joint,) = alike_in_both(aside, capture).joints
     assert joint.confidence < 0.75 * aside.joints[0].confidence
     assert joint.review == "Where the part lies in either state, photos of the two do not look alike."
+
+
+def test_a_fitted_part_that_lies_beside_its_place_is_laid_anew():
+    true = with_a_base(slide(0.0), PATCHES)
+    laid = laid_anew(with_a_base(slide(0.05), PATCHES).parts, photographed(true))
+    assert list(laid) == [1]
+    corners = true.parts.boxes.corners[1].double()
+    torch.testing.assert_close(laid[1].apply(corners), slide(0.0).apply(corners), atol=0.005, rtol=0)
+
+
+def test_a_fitted_part_that_looks_the_same_all_over_stays():
+    capture = photographed(with_a_base(slide(0.0), PLAIN))
+    assert laid_anew(with_a_base(slide(0.05), PLAIN).parts, capture) == {}

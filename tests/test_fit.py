@@ -15,6 +15,7 @@ from structuregs.capture import stack_views
 from structuregs.fit.boxes import base_tightened, drawn_out, squared_up, tightened
 from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
+from structuregs.fit.laying import held_along_base, lie_along_base
 from structuregs.fit.loop import FitState, Fitter, askew
 from structuregs.fit.merge import idle_part, moving_alike
 from structuregs.fit.reconstruct import choose_device, finished_object
@@ -22,7 +23,7 @@ from structuregs.fit.run import RunFolder
 from structuregs.fit.schedule import PRESETS, FitConfig, Growth, Rates
 from structuregs.fit.straight import straight_where_loose
 from structuregs.fit.variables import SPLAT_NAMES, Variables, part_index
-from structuregs.geometry import SE3, Box, Screw, quat_to_matrix
+from structuregs.geometry import SE3, Box, JointKind, Screw, quat_to_matrix
 from structuregs.joints import constrain
 from structuregs.model import ArticulatedObject, PosedParts, Splats
 from structuregs.raster import render
@@ -170,6 +171,17 @@ class TestVariables:
         variables = Variables.of(made_of().parts)
         variables.hold([])
         same_motion(variables.motions(), SE3.identity(1), atol=0)
+
+    @pytest.mark.parametrize("kinds", [None, ("revolute", "prismatic")])
+    def test_a_motion_can_be_set(self, kinds: tuple[JointKind, JointKind] | None):
+        variables = Variables.of(turned_parts(), give_way=0.5)
+        if kinds:
+            variables.hold(kinds)
+        others = variables.motions().wxyz_xyz.detach().clone()[[0, 2]]
+        turn = Screw("revolute", torch.tensor([0.6, 0.0, 0.8]).double(), torch.tensor([0.3, -0.2, 0.1]).double()).motion(0.7)
+        variables.set_motion(1, turn)
+        same_motion(variables.motions()[1], turn)
+        torch.testing.assert_close(variables.motions().wxyz_xyz[[0, 2]], others, atol=0, rtol=0)
 
 
 def gradients_of(count: int, strong: Tensor) -> ScreenGradients:
@@ -437,6 +449,33 @@ class TestOptimiser:
         list(fit.run(21))
         assert not torch.equal(fit.state.variables.motions().wxyz_xyz, start)
 
+    def test_a_part_that_was_laid_anew_rests_while_the_others_move(self):
+        fit = fitter(replace(QUICK, laid_until=0.5, straight_until=0.0))
+        fit.state.laid[1] = True
+        start = fit.state.variables.motions().wxyz_xyz.detach().clone()
+        list(fit.run(20))
+        now = fit.state.variables.motions().wxyz_xyz
+        assert torch.equal(now[1], start[1])
+        assert not torch.equal(now[2], start[2])
+        list(fit.run(21))
+        assert not torch.equal(fit.state.variables.motions().wxyz_xyz[1], start[1])
+
+    @pytest.mark.parametrize("one_joint_from", [0.2, 1.0])
+    def test_a_joint_along_the_base_stays_so_until_its_time_has_come(self, one_joint_from: float):
+        """Its photos see the drawer come out askew."""
+        straight = made_of(DOOR.motion(), SE3.from_quat(SE3.identity().wxyz, torch.tensor([0.0, -0.4, 0.0]))).parts
+        askew_drawer = SE3.from_quat(SE3.identity().wxyz, torch.tensor([0.03, -0.4, 0.0]))
+        config = replace(QUICK, along_base=0.0, straight_until=0.5, lay_at=1.0, square_at=(), one_joint_from=one_joint_from)
+        capture = photographed(made_of(DOOR.motion(), askew_drawer))
+        fit = Fitter(capture, config, FitState.start(straight), 0, torch.device("cpu"))
+        assert fit.state.straight.tolist() == [False, True, True]
+        list(fit.run(20))
+        moved = fit.state.variables.parts().detach()
+        assert float(askew(moved, ["revolute", "prismatic"])) < 1e-10
+        assert not torch.equal(moved.motions.wxyz_xyz, straight.motions.wxyz_xyz)
+        list(fit.run(40))
+        assert float(askew(fit.state.variables.parts().detach(), ["revolute", "prismatic"])) > 1e-7
+
     def test_a_fit_to_its_own_pictures_brings_a_wrong_motion_back(self):
         off = SE3.exp(torch.tensor([[0.0] * 6, [0.02, -0.02, 0.01, 0.0, 0.03, -0.06], [0.0] * 6]))
         parts = replace(DOOR_AND_DRAWER, motions=off @ DOOR_AND_DRAWER.motions)
@@ -523,6 +562,25 @@ def jointed(way: Tensor, tilt: float = 0.0) -> PosedParts:
     motions[1] = Screw("revolute", hinge / hinge.norm(), torch.ones(3, dtype=torch.float64)).motion(0.8).wxyz_xyz.float()
     motions[2] = SE3.from_quat(SE3.identity().wxyz, axes @ way).wxyz_xyz
     return replace(parts, motions=SE3(motions.requires_grad_()))
+
+
+class TestAlongBase:
+    @pytest.mark.parametrize(("degrees", "along"), [(0.0, True), (0.01, True), (0.5, False), (20.0, False)])
+    def test_a_joint_lies_along_the_base_or_does_not(self, degrees: float, along: bool):
+        angle = math.radians(degrees)
+        parts = jointed(0.3 * torch.tensor([0.0, -math.cos(angle), math.sin(angle)]), tilt=angle).detach()
+        assert lie_along_base(parts).tolist() == [False, along, along]
+
+    def test_what_stands_still_has_no_axis(self):
+        assert lie_along_base(jointed(torch.zeros(3)).detach()).tolist() == [False, True, False]
+
+    def test_held_along_it_a_part_s_centre_goes_on_the_nearest_way(self):
+        angle = math.radians(3)
+        parts = jointed(0.3 * torch.tensor([0.0, -math.cos(angle), math.sin(angle)])).detach()
+        motions = held_along_base(parts, torch.tensor([False, False, True]))
+        assert list(motions) == [2]
+        way = parts.boxes.T_world_box.rotation[0].T.double() @ motions[2].xyz
+        torch.testing.assert_close(way, torch.tensor([0.0, -0.3 * math.cos(angle), 0.0]).double(), atol=1e-6, rtol=0)
 
 
 class TestAskew:

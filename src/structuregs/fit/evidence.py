@@ -9,13 +9,12 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy import ndimage
 from torch import Tensor
 
-from ..boxes import Overlap, Shown
 from ..capture import Capture, ImageStack, spread_cameras, stack_views
-from ..geometry import SE3, Box, Camera
+from ..geometry import Camera
 from ..joints import REVIEW_BELOW
 from ..model import ArticulatedObject, Joint, PosedParts, Splats
 from ..raster import coverage_of, painted, render
-from .boxes import object_size
+from .laying import BothStates
 
 _SIZE = 128  # side of a square with as many pixels as the photos that are asked
 _PHOTOS = 16  # of either state
@@ -27,10 +26,7 @@ _GAPS, _HOLE = 0.005, 0.08  # of what photos show: nothing to say of so much unc
 _RIM, _BESIDE = 0.003, 0.012  # of the pixels that a part covers: the same of pixels that masks and model see differently
 _LOOK = 400  # side of a square with as many pixels as the pictures that tell
 _LOOKS = 48  # of either state
-_CLOSER = 200  # side of a square with as many pixels as the photos that are laid upon each other
-_LAID = 24  # of either state
 _FEWEST = 50  # pixels that say something
-_EXACT = 1 / 64  # of the object's size: how exactly surfaces are known
 _NOTHING = 0.4  # photos that leave so much more unexplained of each other than nothing would say that a part is elsewhere
 
 
@@ -202,22 +198,9 @@ def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject
         obj: as fitted.
         capture: what it was fitted to.
     """
-    parts = obj.parts.to(torch.device("cpu"))
-    unit = _EXACT * object_size(parts.boxes)
-    stacks = [
-        stack_views([views[v] for v in spread_cameras([view.camera for view in views], _LAID)], _CLOSER)
-        for views in capture.train
-    ]
-    boxes = Box(SE3(parts.boxes.T_world_box.wxyz_xyz.double()), parts.boxes.half_extents.double())
-    joints = []
+    both, joints = BothStates(obj.parts, capture), []
     for k, joint in enumerate(obj.joints, start=1):
-        first, second = (Shown(stack, parts.at_state(state), parts.part == k) for state, stack in enumerate(stacks))
-        motion = SE3(parts.motions.wxyz_xyz[k].double())
-        laid = (
-            Overlap.between(first, second, motion, boxes[k], unit),
-            Overlap.between(second, first, motion.inverse(), boxes[k].moved(motion), unit),
-        )
-        left = [overlap.unlike() for overlap in laid if len(overlap) > _FEWEST]
+        left = [overlap.unlike() for overlap in (both.laid(k, s) for s in (0, 1)) if len(overlap) > _FEWEST]
         score = _score(max(left, default=0.0), 1.0, _NOTHING)
         sentence = "Where the part lies in either state, photos of the two do not look alike."
         joints.append(_lowered(joint, score, sentence))

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..capture import Capture, ImageStack, stack_views
@@ -24,6 +24,7 @@ from .boxes import base_tightened, drawn_out, object_size, squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
 from .evidence import shown
+from .laying import held_along_base, laid_anew, lie_along_base
 from .merge import idle_part, moving_alike
 from .schedule import FitConfig
 from .structure import StructureWeights, structure_loss
@@ -56,6 +57,8 @@ class FitState:
         offset: by which the principal point of all cameras was moved (see `Camera.shifted`), a leaf for the optimiser.
         turns: by which the training cameras of either state were turned (see `Camera.turned`); None where they were right.
         anew: whether the fit has begun with the cameras already turned.
+        straight: which parts' joints lay along the base's box at the start.
+        laid: which parts have been laid anew.
     """
 
     variables: Variables
@@ -66,6 +69,8 @@ class FitState:
     size: float
     step: int
     offset: Float[Tensor, " 2"]
+    straight: Bool[Tensor, " K"]
+    laid: Bool[Tensor, " K"]
     turns: tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]] | None = None
     anew: bool = False
 
@@ -83,6 +88,8 @@ class FitState:
             object_size(parts.boxes),
             0,
             torch.zeros(2, requires_grad=True),
+            lie_along_base(parts),
+            torch.zeros(len(parts), dtype=torch.bool),
         )
 
     def save(self, file: Path) -> None:
@@ -104,6 +111,8 @@ class FitState:
             "offset": self.offset.detach(),
             "turns": self.turns,
             "anew": self.anew,
+            "straight": self.straight,
+            "laid": self.laid,
         }
         with replacing(file) as staged:
             torch.save(record, staged)
@@ -122,11 +131,12 @@ class FitState:
             variables = Variables(leaves, tuple(r["counts"]), r["give_way"], r["kinds"], r["start"], r["centres"])
             gradients = ScreenGradients(*r["gradients"])
             rest = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "anew")}
-            # Cameras are on the CPU whatever the device.
+            # Cameras are on the CPU whatever the device, and so is what is noted of parts.
             offset, turns = r["offset"].cpu().requires_grad_(), r["turns"] and tuple(t.cpu() for t in r["turns"])
+            rest |= {"offset": offset, "turns": turns, "straight": r["straight"].cpu(), "laid": r["laid"].cpu()}
             first, second = rest["moments"]["principal_point"]
             rest["moments"]["principal_point"] = (first.cpu(), second.cpu())
-            return FitState(variables, gradients=gradients, offset=offset, turns=turns, **rest)
+            return FitState(variables, gradients=gradients, **rest)
         except _DAMAGED as error:
             raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
 
@@ -159,6 +169,8 @@ class Fitter:
                 yield from self._aim_cameras()
             if self.state.step in [round(at * self.config.steps) for at in self.config.square_at]:
                 self._square_up()
+            if self.state.step == round(self.config.lay_at * self.config.steps):
+                yield from self._lay_anew()
             yield from self._settle_joints()
             loss, psnr = self._step()
             self._densify()
@@ -204,6 +216,18 @@ class Fitter:
         for name in ("means", "quats", "sh"):
             variables.leaves[name].copy_(getattr(parts.splats, name))
         variables.set_boxes(parts.boxes)
+
+    def _lay_anew(self) -> Iterator[FitEvent]:
+        """Lays parts where photos of both states are alike; their motions then rest for a while."""
+        variables, capture = self.state.variables, self.capture
+        if self.state.turns is not None:
+            capture = capture.turned(self.state.turns)
+        motions = laid_anew(variables.parts().detach(), capture.shifted(self.state.offset.detach()))
+        for k, motion in motions.items():
+            variables.set_motion(k, motion)
+            self.state.laid[k] = True
+        if motions:
+            yield Note(f"parts laid anew in their planes at step {self.state.step}: {', '.join(map(str, motions))}")
 
     def _settle_joints(self) -> Iterator[FitEvent]:
         """Holds every motion to one degree of freedom once its time has come."""
@@ -267,7 +291,7 @@ class Fitter:
                 self.state.gradients.add(picture.projection, max(picture.alpha.shape) / config.image_weight)
         if pictures and self._rate("principal_point"):
             self.state.offset.grad = sum((offset_gradient(*picture) for picture in pictures), torch.zeros(2))
-        self._adam()
+        self._move()
         return float(loss.detach()), psnr
 
     def _structure_loss(self, parts: PosedParts) -> Tensor:
@@ -344,6 +368,20 @@ class Fitter:
         finals = {"means": rates.means_final, "motions": rates.motions_final, "principal_point": rates.poses_final}
         final = finals.get(name, rates.appearance_final)
         return getattr(rates, name) * final**done
+
+    @torch.no_grad()
+    def _move(self) -> None:
+        """A step of the optimiser; motions that are to rest do, and those that are to stay straight do."""
+        state, config, variables = self.state, self.config, self.state.variables
+        before = variables.leaves["motions"].clone()
+        self._adam()
+        if not self._rate("motions"):
+            return
+        if state.step < config.laid_until * config.steps:
+            variables.leaves["motions"][state.laid] = before[state.laid]
+        if state.step < config.straight_until * config.steps:
+            for k, motion in held_along_base(variables.parts(), state.straight).items():
+                variables.set_motion(k, motion)
 
     @torch.no_grad()
     def _adam(self) -> None:

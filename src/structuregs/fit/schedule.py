@@ -116,9 +116,17 @@ class FitConfig:
     """Part of the fit after which faces are made plane: what is hollow has to be found hollow before."""
     planarity_size: int = 160
     """Size of the images that it is taken from: the side of a square with as many pixels."""
+    lay_at: float = 0.35
+    """Part of the fit after which parts are laid anew in the plane of their face, where photos of both states are alike; 1 for
+    never."""
+    laid_until: float = 0.5
+    """Part of the fit up to which the motions of those parts then rest, until splats have forgotten where they were before."""
     along_base: float = 1.0
     """Of the squared sine of the angle between a joint's axis and the nearest one of the base's box, where that is small.  At
     the end joints that photos do not tell from ones along the base go along it.  0 for neither."""
+    straight_until: float = 0.8
+    """Part of the fit up to which joints that begin along the base's box stay along it.  While splats settle, photos of a plain
+    front draw its axis aside, and splats then hold it there; one that is truly askew comes home afterwards.  0 for none."""
     square_at: tuple[float, ...] = (0.35, 0.6)
     """Parts of the fit after which boxes are turned along the faces of their parts, and drawn out where splats press on."""
     join_at: float = 0.35
@@ -171,6 +179,8 @@ PRESETS: dict[str, FitConfig] = {
         along_base=0.0,
         square_at=(),
         join_at=1.0,
+        lay_at=1.0,
+        straight_until=0.0,
         one_joint_from=1.0,
         checkpoint_every=500,
         rates=Rates(

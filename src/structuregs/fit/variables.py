@@ -71,6 +71,18 @@ class Variables:
             self.leaves["box_centres"].copy_(pose.xyz)
             self.leaves["log_half_extents"].copy_(boxes.half_extents.log())
 
+    def set_motion(self, k: int, motion: SE3) -> None:
+        """Sets the leaf so that part k has this motion, as closely as its joint, if it has one by now, lets it."""
+        motion = motion.to(self.start.device, torch.float64)
+        with torch.no_grad():
+            if self.kinds is None:
+                start, centre = SE3(self.start[k].double()), self.centres[k].double()
+                turn = motion @ start.inverse()
+                row = SE3.from_quat(turn.wxyz, turn.apply(centre) - centre).log()
+            else:
+                row = _joint_row(motion, self.kinds[k - 1], self.boxes(self.motions()).T_world_box.xyz[k])
+            self.leaves["motions"][k] = row.to(self.start)
+
     def motions(self) -> SE3:
         """The motions; the base's is the identity whatever its row says."""
         rows = self.leaves["motions"][1:]
@@ -102,13 +114,16 @@ class Variables:
             motions = self.motions()
             boxes = self.boxes(motions)
             for k, kind in enumerate(kinds, start=1):
-                screw, q = screw_at(motions[k], kind, boxes.T_world_box.xyz[k])
-                rows[k, :3] = screw.axis.to(rows) * q
-                if kind == "revolute":
-                    rows[k, 3:] = screw.origin.to(rows)
+                rows[k] = _joint_row(motions[k], kind, boxes.T_world_box.xyz[k]).to(rows)
             self.leaves["motions"].copy_(rows)
             self.kinds = tuple(kinds)
             self.set_boxes(boxes)
+
+
+def _joint_row(motion: SE3, kind: JointKind, centre: Float[Tensor, " 3"]) -> Float[Tensor, " 6"]:
+    """The row of `motions` of a joint that moves its part, whose centre in state 0 this is, most nearly so."""
+    screw, q = screw_at(motion, kind, centre)
+    return torch.cat([screw.axis * q, screw.origin if kind == "revolute" else torch.zeros_like(screw.origin)])
 
 
 def part_index(counts: tuple[int, ...], device: torch.device) -> Int[Tensor, " N"]:

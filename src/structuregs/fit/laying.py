@@ -1,0 +1,85 @@
+"""What photos of the two states show of a fitted part, laid upon each other, and motions that are held meanwhile."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from ..boxes import Face, Overlap, Shown
+from ..capture import Capture, spread_cameras, stack_views
+from ..geometry import SE3, Box, Screw, screw_at, straightened
+from ..joints import kind_of
+from ..model import PosedParts
+from .boxes import object_size
+
+_SIZE = 200  # side of a square with as many pixels as the photos that are laid upon each other
+_PHOTOS = 24  # of either state
+_EXACT = 1 / 64  # of the object's size: how exactly surfaces are known
+_MOVES = 1e-3  # of the object's size: what slides, or radians, by less has no axis
+_STRAIGHT = 1e-6  # one less the cosine (.08 degrees) of the angle between an axis and the base's up to which it lies along it
+
+
+class BothStates:
+    """Photos of the two states, each with the parts as they stand there.
+
+    Args:
+        parts: as fitted so far.
+        capture: what they are fitted to, its cameras as the fit has put them right.
+    """
+
+    def __init__(self, parts: PosedParts, capture: Capture):
+        self.parts = parts.to(torch.device("cpu"))
+        self._stacks = [
+            stack_views([views[v] for v in spread_cameras([view.camera for view in views], _PHOTOS)], _SIZE)
+            for views in capture.train
+        ]
+        self._shown: dict[int, list[Shown]] = {}
+
+    def laid(self, k: int, state: int) -> Overlap:
+        """What photos of a state show of part k, laid upon those of the other as its motion says."""
+        parts, pose = self.parts, self.parts.boxes.T_world_box.wxyz_xyz[k]
+        if k not in self._shown:
+            shown = [Shown(stack, parts.at_state(s), parts.part == k) for s, stack in enumerate(self._stacks)]
+            self._shown = {k: shown}  # photos of one part are asked at a time, and take room
+        motion, box = SE3(parts.motions.wxyz_xyz[k].double()), Box(SE3(pose.double()), parts.boxes.half_extents[k].double())
+        way, own = (motion.inverse(), box.moved(motion)) if state else (motion, box)
+        return Overlap.between(self._shown[k][state], self._shown[k][1 - state], way, own, _EXACT * object_size(parts.boxes))
+
+
+@torch.no_grad()
+def laid_anew(parts: PosedParts, capture: Capture) -> dict[int, SE3]:
+    """The motions of parts that photos ask to be laid elsewhere in the plane of their face, by part.
+
+    A shut door whose motion is a little off has its handle painted twice, each copy for the photos of one state, and from then
+    on the two hold it where it is.  The photos themselves, laid upon each other, say where it belongs.
+
+    Args:
+        parts: as fitted so far.
+        capture: what they are fitted to, its cameras as the fit has put them right.
+    """
+    both = BothStates(parts, capture)
+    motions = {k: Face.most_shown(both.laid(k, 0)).laid_alike() for k in range(1, len(parts))}
+    return {k: motion for k, motion in motions.items() if motion is not None}
+
+
+def lie_along_base(parts: PosedParts) -> Bool[Tensor, " K"]:
+    """Which parts' joints lie along an axis of the base's box; what does not move has no axis."""
+    axes, least = parts.boxes.T_world_box.rotation[0].double().T, _MOVES * object_size(parts.boxes)
+    joints = [_screw(parts, k) for k in range(1, len(parts))]
+    along = [q > least and bool((axes @ screw.axis).abs().max() > 1 - _STRAIGHT) for screw, q in joints]
+    return torch.tensor([False, *along])
+
+
+def held_along_base(parts: PosedParts, chosen: Bool[Tensor, " K"]) -> dict[int, SE3]:
+    """The motions of the chosen parts along the nearest axes of the base's box, by part."""
+    base = replace(parts.boxes[0], T_world_box=parts.boxes[0].T_world_box.to(dtype=torch.float64))
+    held = {}
+    for k in torch.argwhere(chosen)[:, 0].tolist():
+        screw, q = straightened(*_screw(parts, k), base)
+        held[k] = screw.motion(q)
+    return held
+
+
+def _screw(parts: PosedParts, k: int) -> tuple[Screw, float]:
+    return screw_at(parts.motions[k], kind_of(parts.motions[k]), parts.boxes.T_world_box.xyz[k])
