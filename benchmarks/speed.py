@@ -29,8 +29,9 @@ from raster import make_scene
 
 from structuregs.capture import Capture, View
 from structuregs.fit.densify import grow
-from structuregs.fit.loop import FitState, Fitter
+from structuregs.fit.loop import Fitter
 from structuregs.fit.schedule import PRESETS, FitConfig
+from structuregs.fit.state import FitState
 from structuregs.geometry import SE3, Box, Camera
 from structuregs.model import PosedParts, Splats
 from structuregs.raster import blend_kernels as bk

@@ -13,9 +13,10 @@ from door_and_drawer import DOOR, DRAWER, made_of
 from structuregs.capture import Capture, View, stack_views
 from structuregs.fit.aim import beside, misaim, offset_gradient, with_coverage
 from structuregs.fit.events import Note
-from structuregs.fit.loop import FitState, Fitter
+from structuregs.fit.loop import Fitter
 from structuregs.fit.run import RunFolder
 from structuregs.fit.schedule import FitConfig, Growth, Rates
+from structuregs.fit.state import FitState
 from structuregs.geometry import SE3, Camera
 from structuregs.raster import image_loss, render
 

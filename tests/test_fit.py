@@ -15,13 +15,13 @@ from structuregs.capture import stack_views
 from structuregs.fit.boxes import base_tightened, drawn_out, squared_up, tightened
 from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
-from structuregs.fit.laying import held_along_base, lie_along_base
-from structuregs.fit.loop import FitState, Fitter, askew
+from structuregs.fit.loop import Fitter
 from structuregs.fit.merge import idle_part, moving_alike
 from structuregs.fit.reconstruct import choose_device, finished_object
 from structuregs.fit.run import RunFolder
 from structuregs.fit.schedule import PRESETS, FitConfig, Growth, Rates
-from structuregs.fit.straight import straight_where_loose
+from structuregs.fit.state import FitState
+from structuregs.fit.straight import askew, held_along_base, lie_along_base, straight_where_loose
 from structuregs.fit.variables import SPLAT_NAMES, Variables, part_index
 from structuregs.geometry import SE3, Box, JointKind, Screw, quat_to_matrix
 from structuregs.joints import constrain

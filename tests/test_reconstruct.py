@@ -17,10 +17,10 @@ from structuregs.boxes import SearchConfig, StartConfig
 from structuregs.boxes.appearance import AppearanceConfig
 from structuregs.capture import Capture, TrueJoint, load_capture
 from structuregs.fit.events import Finished, FitEvent, Note, StageStarted, Step
-from structuregs.fit.loop import FitState
 from structuregs.fit.reconstruct import fit_run, reconstruct
 from structuregs.fit.run import RunFolder
 from structuregs.fit.schedule import FitConfig, Growth
+from structuregs.fit.state import FitState
 from structuregs.geometry import SE3
 from structuregs.model import ArticulatedObject, Joint, load_object
 from structuregs.synthetic import RenderOptions, make_capture, make_object, save_known

@@ -18,9 +18,9 @@ from door_and_drawer import made_of, photographed
 from structuregs.export.html import page_of, scene_of
 from structuregs.export.sweep import telling_order
 from structuregs.fit.events import Preview
-from structuregs.fit.loop import FitState
 from structuregs.fit.reconstruct import fit_run
 from structuregs.fit.schedule import FitConfig, Growth
+from structuregs.fit.state import FitState
 from structuregs.geometry import Screw
 from structuregs.model import ArticulatedObject
 from structuregs.view import LivePage, serve

@@ -1,23 +1,16 @@
-"""What photos of the two states show of a fitted part, laid upon each other, and motions that are held meanwhile."""
-
-from dataclasses import replace
+"""What photos of the two states show of a fitted part, laid upon each other."""
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from ..boxes import Face, Overlap, Shown
 from ..capture import Capture, spread_cameras, stack_views
-from ..geometry import SE3, Box, Screw, screw_at, straightened
-from ..joints import kind_of
+from ..geometry import SE3, Box
 from ..model import PosedParts
 from .boxes import object_size
 
 _SIZE = 200  # side of a square with as many pixels as the photos that are laid upon each other
 _PHOTOS = 24  # of either state
 _EXACT = 1 / 64  # of the object's size: how exactly surfaces are known
-_MOVES = 1e-3  # of the object's size: what slides, or radians, by less has no axis
-_STRAIGHT = 1e-6  # one less the cosine (.08 degrees) of the angle between an axis and the base's up to which it lies along it
 
 
 class BothStates:
@@ -61,25 +54,3 @@ def laid_anew(parts: PosedParts, capture: Capture) -> dict[int, SE3]:
     both = BothStates(parts, capture)
     motions = {k: Face.most_shown(both.laid(k, 0)).laid_alike() for k in range(1, len(parts))}
     return {k: motion for k, motion in motions.items() if motion is not None}
-
-
-def lie_along_base(parts: PosedParts) -> Bool[Tensor, " K"]:
-    """Which parts' joints lie along an axis of the base's box; what does not move has no axis."""
-    axes, least = parts.boxes.T_world_box.rotation[0].double().T, _MOVES * object_size(parts.boxes)
-    joints = [_screw(parts, k) for k in range(1, len(parts))]
-    along = [q > least and bool((axes @ screw.axis).abs().max() > 1 - _STRAIGHT) for screw, q in joints]
-    return torch.tensor([False, *along])
-
-
-def held_along_base(parts: PosedParts, chosen: Bool[Tensor, " K"]) -> dict[int, SE3]:
-    """The motions of the chosen parts along the nearest axes of the base's box, by part."""
-    base = replace(parts.boxes[0], T_world_box=parts.boxes[0].T_world_box.to(dtype=torch.float64))
-    held = {}
-    for k in torch.argwhere(chosen)[:, 0].tolist():
-        screw, q = straightened(*_screw(parts, k), base)
-        held[k] = screw.motion(q)
-    return held
-
-
-def _screw(parts: PosedParts, k: int) -> tuple[Screw, float]:
-    return screw_at(parts.motions[k], kind_of(parts.motions[k]), parts.boxes.T_world_box.xyz[k])

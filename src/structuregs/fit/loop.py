@@ -1,149 +1,39 @@
 """The fit's loop: posed parts in, better posed parts out, one view of either state a step."""
 
 import functools
-import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from pickle import UnpicklingError
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..capture import Capture, ImageStack, stack_views
-from ..files import replacing
 from ..geometry import SE3, Camera, JointKind
 from ..joints import kind_of
 from ..model import PosedParts, Splats
 from ..raster import Render, image_loss, render
 from .aim import beside, misaim, offset_gradient, with_coverage
-from .boxes import base_tightened, drawn_out, object_size, squared_up
+from .boxes import base_tightened, drawn_out, squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
 from .evidence import shown
-from .laying import held_along_base, laid_anew, lie_along_base
+from .laying import laid_anew
 from .merge import idle_part, moving_alike
 from .schedule import FitConfig
+from .state import FitState
+from .straight import askew, held_along_base
 from .structure import StructureWeights, structure_loss
 from .surface import planarity_loss, thickness
-from .variables import SPLAT_NAMES, Variables
+from .variables import SPLAT_NAMES
 
 _REPORT_EVERY = 10
 _BESIDE = 0.2  # pixels of the photos that steps work at: photos that lie farther beside have their cameras turned
 _AIM = 0.5  # of the way that a photo asks for: the other photos speak too
-_SQUARE_WITHIN = float(np.sin(np.deg2rad(10))) ** 2
 _Value = TypeVar("_Value")
 _BOX_NAMES = ("box_quats", "box_centres", "log_half_extents")
 _POSE_NAMES = ("motions", "principal_point")
-# What torch raises over a file that was cut short or is something else, and what reading another record raises.
-_DAMAGED = (RuntimeError, EOFError, OSError, UnpicklingError, AttributeError, KeyError, TypeError, ValueError)
-
-
-@dataclass
-class FitState:
-    """All that a fit needs to go on: what a checkpoint holds.
-
-    Attributes:
-        variables: what is being fitted.
-        moments: Adam's two moments of every leaf.
-        taken: Adam's steps of every leaf since its moments were last zero.
-        gradients: screen-space gradients since the last round of densification.
-        free_motions: the K motions (wxyz_xyz) as they were when they were still free.
-        size: of the object, about its radius, as the boxes had it before the first step; world units.
-        step: steps done.
-        offset: by which the principal point of all cameras was moved (see `Camera.shifted`), a leaf for the optimiser.
-        turns: by which the training cameras of either state were turned (see `Camera.turned`); None where they were right.
-        anew: whether the fit has begun with the cameras already turned.
-        straight: which parts' joints lay along the base's box at the start.
-        laid: which parts have been laid anew.
-    """
-
-    variables: Variables
-    moments: dict[str, tuple[Tensor, Tensor]]
-    taken: dict[str, int]
-    gradients: ScreenGradients
-    free_motions: Tensor
-    size: float
-    step: int
-    offset: Float[Tensor, " 2"]
-    straight: Bool[Tensor, " K"]
-    laid: Bool[Tensor, " K"]
-    turns: tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]] | None = None
-    anew: bool = False
-
-    @staticmethod
-    def start(parts: PosedParts, give_way: float = 0.0) -> "FitState":
-        """The state before the first step; give_way: see `Variables`."""
-        variables = Variables.of(parts, give_way)
-        gradients = ScreenGradients.zeros(sum(parts.counts), parts.tint.device)
-        return FitState(
-            variables,
-            _no_moments(variables),
-            dict.fromkeys([*variables.leaves, "principal_point"], 0),
-            gradients,
-            parts.motions.wxyz_xyz.clone(),
-            object_size(parts.boxes),
-            0,
-            torch.zeros(2, requires_grad=True),
-            lie_along_base(parts),
-            torch.zeros(len(parts), dtype=torch.bool),
-        )
-
-    def save(self, file: Path) -> None:
-        """Writes the checkpoint aside and renames it."""
-        v = self.variables
-        record = {
-            "leaves": {name: leaf.detach() for name, leaf in v.leaves.items()},
-            "counts": v.counts,
-            "give_way": v.give_way,
-            "kinds": v.kinds,
-            "start": v.start,
-            "centres": v.centres,
-            "moments": self.moments,
-            "taken": self.taken,
-            "gradients": (self.gradients.total, self.gradients.seen),
-            "free_motions": self.free_motions,
-            "size": self.size,
-            "step": self.step,
-            "offset": self.offset.detach(),
-            "turns": self.turns,
-            "anew": self.anew,
-            "straight": self.straight,
-            "laid": self.laid,
-        }
-        with replacing(file) as staged:
-            torch.save(record, staged)
-
-    @staticmethod
-    def load(file: Path, device: torch.device | None = None) -> "FitState":
-        """Reads a checkpoint.
-
-        Raises:
-            ValueError: the file is damaged.
-        """
-        content = io.BytesIO(file.read_bytes())
-        try:
-            r = torch.load(content, map_location=device, weights_only=True)
-            leaves = {name: leaf.requires_grad_() for name, leaf in r["leaves"].items()}
-            variables = Variables(leaves, tuple(r["counts"]), r["give_way"], r["kinds"], r["start"], r["centres"])
-            gradients = ScreenGradients(*r["gradients"])
-            rest = {name: r[name] for name in ("moments", "taken", "free_motions", "size", "step", "anew")}
-            # Cameras are on the CPU whatever the device, and so is what is noted of parts.
-            offset, turns = r["offset"].cpu().requires_grad_(), r["turns"] and tuple(t.cpu() for t in r["turns"])
-            rest |= {"offset": offset, "turns": turns, "straight": r["straight"].cpu(), "laid": r["laid"].cpu()}
-            first, second = rest["moments"]["principal_point"]
-            rest["moments"]["principal_point"] = (first.cpu(), second.cpu())
-            return FitState(variables, gradients=gradients, **rest)
-        except _DAMAGED as error:
-            raise ValueError(f"{file}: the checkpoint is damaged; delete it to fit this run from the start.") from error
-
-
-def _no_moments(variables: Variables) -> dict[str, tuple[Tensor, Tensor]]:
-    leaves = {name: leaf.detach() for name, leaf in variables.leaves.items()} | {"principal_point": torch.zeros(2)}
-    return {name: (torch.zeros_like(leaf), torch.zeros_like(leaf)) for name, leaf in leaves.items()}
 
 
 class Fitter:
@@ -432,20 +322,3 @@ def _order(seed: int, state: int, turn: int, count: int) -> np.ndarray:
 def _kinds(parts: PosedParts) -> list[JointKind]:
     """The types of the moving parts as they now move."""
     return [kind_of(parts.motions[k]) for k in range(1, len(parts))]
-
-
-def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
-    """Sum over joints of the squared sine of the angle to the nearest axis of the base's box, no more than at 10 degrees.
-
-    Drawers run square to what holds them and hinges lie along its edges, and the photos of a plain front say little about
-    either.  What slides by less than a thousandth of the base's half diagonal has no direction.
-    """
-    least = float(parts.boxes.half_extents[0].detach().norm()) / 1000
-    axes, centres = parts.boxes.T_world_box.rotation[0].detach().T, parts.boxes.T_world_box.xyz.detach()
-    total = axes.new_zeros(())
-    for k, kind in enumerate(kinds, start=1):
-        motion = parts.motions[k]
-        way = motion.apply(centres[k]) - centres[k] if kind == "prismatic" else motion.wxyz[1:]
-        direction = torch.nn.functional.normalize(way, dim=0, eps=least if kind == "prismatic" else 1e-6)
-        total = total + (1 - (axes @ direction).square().max()).clamp(max=_SQUARE_WITHIN)
-    return total

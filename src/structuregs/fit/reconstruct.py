@@ -19,9 +19,10 @@ from ..points import points_from
 from .boxes import object_size, tightened
 from .events import Finished, FitEvent, Note, Preview, StageStarted, Step
 from .evidence import alike_in_both, covered_in_both, outlined_in_both, seen_in_both
-from .loop import FitState, Fitter
+from .loop import Fitter
 from .run import Clock, RunFolder
 from .schedule import PRESETS, FitConfig
+from .state import FitState
 from .straight import straight_where_loose
 
 _PREVIEW_EVERY = 50  # steps

@@ -1,18 +1,62 @@
-"""Joints that photos do not tell from straight ones."""
+"""Joints along the axes of the base's box: what is built square moves square, and photos of a plain front hardly say."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from ..capture import Capture, spread_cameras, stack_views
-from ..geometry import screw_at, straightened
-from ..model import ArticulatedObject
+from ..geometry import SE3, JointKind, Screw, screw_at, straightened
+from ..joints import kind_of
+from ..model import ArticulatedObject, PosedParts
+from .boxes import object_size
 from .merge import colour_errors, standard_error
 
+_MOVES = 1e-3  # of the object's size: what slides, or radians, by less has no axis
+_STRAIGHT = 1e-6  # one less the cosine (.08 degrees) of the angle between an axis and the base's up to which it lies along it
+_SQUARE_WITHIN = float(np.sin(np.deg2rad(10))) ** 2
 _SIZE = 800  # side of a square with as many pixels as the photos that are asked; never more than they have
 _PHOTOS = 24
 _CLEAR = 2.0  # standard errors over the photos by which their error grows where they tell two motions apart, ...
 _TOLD = 0.005  # ...or so much of it: a photo that is worse by more tells them apart however few there are
+
+
+def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
+    """Sum over joints of the squared sine of the angle to the nearest axis of the base's box, no more than at 10 degrees.
+
+    Drawers run square to what holds them and hinges lie along its edges, and the photos of a plain front say little about
+    either.  What slides by less than a thousandth of the base's half diagonal has no direction.
+    """
+    least = float(parts.boxes.half_extents[0].detach().norm()) / 1000
+    axes, centres = parts.boxes.T_world_box.rotation[0].detach().T, parts.boxes.T_world_box.xyz.detach()
+    total = axes.new_zeros(())
+    for k, kind in enumerate(kinds, start=1):
+        motion = parts.motions[k]
+        way = motion.apply(centres[k]) - centres[k] if kind == "prismatic" else motion.wxyz[1:]
+        direction = torch.nn.functional.normalize(way, dim=0, eps=least if kind == "prismatic" else 1e-6)
+        total = total + (1 - (axes @ direction).square().max()).clamp(max=_SQUARE_WITHIN)
+    return total
+
+
+def lie_along_base(parts: PosedParts) -> Bool[Tensor, " K"]:
+    """Which parts' joints lie along an axis of the base's box; what does not move has no axis."""
+    axes, least = parts.boxes.T_world_box.rotation[0].double().T, _MOVES * object_size(parts.boxes)
+    joints = [_screw(parts, k) for k in range(1, len(parts))]
+    along = [q > least and bool((axes @ screw.axis).abs().max() > 1 - _STRAIGHT) for screw, q in joints]
+    return torch.tensor([False, *along])
+
+
+def held_along_base(parts: PosedParts, chosen: Bool[Tensor, " K"]) -> dict[int, SE3]:
+    """The motions of the chosen parts along the nearest axes of the base's box, by part."""
+    base = replace(parts.boxes[0], T_world_box=parts.boxes[0].T_world_box.to(dtype=torch.float64))
+    held = {}
+    for k in torch.argwhere(chosen)[:, 0].tolist():
+        screw, q = straightened(*_screw(parts, k), base)
+        held[k] = screw.motion(q)
+    return held
 
 
 @torch.no_grad()
@@ -43,3 +87,7 @@ def straight_where_loose(obj: ArticulatedObject, capture: Capture) -> Articulate
             parts, own = straight, errors
             joints[k - 1] = replace(joint, axis=tuple(screw.axis.tolist()), origin=tuple(screw.origin.tolist()), q=(0.0, q))
     return replace(obj, parts=parts, joints=tuple(joints))
+
+
+def _screw(parts: PosedParts, k: int) -> tuple[Screw, float]:
+    return screw_at(parts.motions[k], kind_of(parts.motions[k]), parts.boxes.T_world_box.xyz[k])
