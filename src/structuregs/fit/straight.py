@@ -16,7 +16,7 @@ from .boxes import object_size
 from .merge import colour_errors, standard_error
 
 _MOVES = 1e-3  # of the object's size: what slides, or radians, by less has no axis
-_STRAIGHT = 1e-6  # one less the cosine (.08 degrees) of the angle between an axis and the base's up to which it lies along it
+_STRAIGHT = float(np.cos(np.deg2rad(2.0)))  # what leans less against the base is taken for straight: it comes home if not
 _SQUARE_WITHIN = float(np.sin(np.deg2rad(10))) ** 2
 _SIZE = 800  # side of a square with as many pixels as the photos that are asked; never more than they have
 _PHOTOS = 24
@@ -42,10 +42,10 @@ def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
 
 
 def lie_along_base(parts: PosedParts) -> Bool[Tensor, " K"]:
-    """Which parts' joints lie along an axis of the base's box; what does not move has no axis."""
+    """Which parts' joints lie along an axis of the base's box, within two degrees; what does not move has no axis."""
     axes, least = parts.boxes.T_world_box.rotation[0].double().T, _MOVES * object_size(parts.boxes)
     joints = [_screw(parts, k) for k in range(1, len(parts))]
-    along = [q > least and bool((axes @ screw.axis).abs().max() > 1 - _STRAIGHT) for screw, q in joints]
+    along = [q > least and bool((axes @ screw.axis).abs().max() > _STRAIGHT) for screw, q in joints]
     return torch.tensor([False, *along])
 
 
