@@ -481,7 +481,7 @@ class TestOptimiser:
         parts = replace(DOOR_AND_DRAWER, motions=off @ DOOR_AND_DRAWER.motions)
         still = Rates(*[0.0] * 7, motions=1e-2, motions_final=0.1)
         growth = Growth(interval=1000)
-        now = replace(QUICK, image_from=0, structure_until=0, motions_from=0.0)
+        now = replace(QUICK, image_from=0, structure_until=0, motions_from=0.0, straight_until=0.0)
         config = replace(now, steps=150, one_joint_from=1.0, rates=still, growth=growth, alpha_weight=0.0, give_way=0.0)
         fit = fitter(config, parts)
         list(fit.run(150))
