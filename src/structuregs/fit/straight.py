@@ -44,17 +44,16 @@ def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
 def lie_along_base(parts: PosedParts) -> Bool[Tensor, " K"]:
     """Which parts' joints lie along an axis of the base's box, within two degrees; what does not move has no axis."""
     axes, least = parts.boxes.T_world_box.rotation[0].double().T, _MOVES * object_size(parts.boxes)
-    joints = [_screw(parts, k) for k in range(1, len(parts))]
+    joints = [_screw(parts, k, kind_of(parts.motions[k])) for k in range(1, len(parts))]
     along = [q > least and bool((axes @ screw.axis).abs().max() > _STRAIGHT) for screw, q in joints]
     return torch.tensor([False, *along])
 
 
 def held_along_base(parts: PosedParts, chosen: Bool[Tensor, " K"]) -> dict[int, SE3]:
     """The motions of the chosen parts along the nearest axes of the base's box, by part."""
-    base = replace(parts.boxes[0], T_world_box=parts.boxes[0].T_world_box.to(dtype=torch.float64))
     held = {}
     for k in torch.argwhere(chosen)[:, 0].tolist():
-        screw, q = straightened(*_screw(parts, k), base)
+        screw, q = _straight(parts, k, kind_of(parts.motions[k]))
         held[k] = screw.motion(q)
     return held
 
@@ -75,11 +74,9 @@ def straight_where_loose(obj: ArticulatedObject, capture: Capture) -> Articulate
         return obj
     stack, parts, joints = stack_views(capture.train[1], _SIZE), obj.parts, list(obj.joints)
     asked = spread_cameras(stack.cameras, _PHOTOS)
-    base, centres = parts.boxes[0], parts.boxes.T_world_box.xyz
-    base = replace(base, T_world_box=base.T_world_box.to(dtype=torch.float64))
     own = colour_errors(parts, stack, asked)
     for k, joint in enumerate(joints, start=1):
-        screw, q = straightened(*screw_at(parts.motions[k], joint.kind, centres[k]), base)
+        screw, q = _straight(parts, k, joint.kind)
         straight = parts.with_motion(k, screw.motion(q))
         errors = colour_errors(straight, stack, asked)
         lost = errors - own
@@ -89,5 +86,11 @@ def straight_where_loose(obj: ArticulatedObject, capture: Capture) -> Articulate
     return replace(obj, parts=parts, joints=tuple(joints))
 
 
-def _screw(parts: PosedParts, k: int) -> tuple[Screw, float]:
-    return screw_at(parts.motions[k], kind_of(parts.motions[k]), parts.boxes.T_world_box.xyz[k])
+def _screw(parts: PosedParts, k: int, kind: JointKind) -> tuple[Screw, float]:
+    return screw_at(parts.motions[k], kind, parts.boxes.T_world_box.xyz[k])
+
+
+def _straight(parts: PosedParts, k: int, kind: JointKind) -> tuple[Screw, float]:
+    """A part's screw along the nearest axis of the base's box, in float64 as all screws are."""
+    base = parts.boxes[0]
+    return straightened(*_screw(parts, k, kind), replace(base, T_world_box=base.T_world_box.to(dtype=torch.float64)))
