@@ -851,6 +851,22 @@ class TestReview:
         monkeypatch.setattr(review, "_continues", lambda *_: continues)
         assert len(review.joined(pieces)) == (1 if continues else 2)
 
+    @pytest.mark.parametrize(("explains", "count"), [(0.4, 1), (0.6, 2)])
+    def test_a_piece_that_explains_little_moves_as_what_it_continues(
+        self, explains: float, count: int, monkeypatch: pytest.MonkeyPatch
+    ):
+        review, right, wrong = self.found()
+        left = right.points[:, 0] < 0.5
+        heavy = 100 * right.weight  # so heavy that what the other state shows of it is nothing
+        plain = replace(right.hypothesis, outside=0.0, unexplained=0.0, oddity=0.0)
+        small = replace(right, pieces=(right.points[~left],), hypothesis=plain, weight=heavy, rivals=())
+        large = replace(wrong, pieces=(right.points[left],), weight=2 * heavy, rivals=())
+        monkeypatch.setattr(review.pieces, "pulled", lambda start, *_: start)
+        monkeypatch.setattr(Trial, "explained", lambda *_: explains * heavy)
+        parts = review._reconsider([large, small])
+        assert len(parts) == count
+        assert parts[0].hypothesis.motion is large.hypothesis.motion
+
     def test_a_small_piece_that_does_not_show_agrees_with_the_part_beside_it_within_what_photos_tell(self):
         """A corner of the screen moves 1.2 voxels otherwise: seen, or far off, or heavier it has a way of its own."""
         review, right, _ = self.found()

@@ -19,7 +19,7 @@ from .judge import Trial
 from .pieces import MovingPart, Pieces
 from .refine import just_out_of_sight, measured
 
-_NO_SCRAP = 0.5  # of a part's weight, of the 2 that it could: what explains so much is none, wherever it lies
+_NO_SCRAP = 0.5  # of a part's weight, of the 2 that it could: what explains so much is no scrap, wherever it lies
 _BLURRED = 1.5  # voxels: no nearer is found how a piece moves that does not show in the other state
 
 
@@ -179,6 +179,9 @@ class PartReview:
             best_of_its_own = min(map(trial.burden, again[: -len(shared)]))
             needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
             alike |= needless & touching & lesser
+            little = _NO_SCRAP * part.weight
+            if not shows and trial.explained(by_cost[0]) < little:  # nor has one that explains little, and loses little
+                alike |= (losses < little) & touching & lesser
 
             twin = int(np.argmin(np.where(alike, losses, np.inf)))
             if alike[twin]:
