@@ -179,7 +179,7 @@ class TestVariables:
             variables.hold(kinds)
         others = variables.motions().wxyz_xyz.detach().clone()[[0, 2]]
         turn = Screw("revolute", torch.tensor([0.6, 0.0, 0.8]).double(), torch.tensor([0.3, -0.2, 0.1]).double()).motion(0.7)
-        variables.set_motion(1, turn)
+        variables.set_motions({1: turn})
         same_motion(variables.motions()[1], turn)
         torch.testing.assert_close(variables.motions().wxyz_xyz[[0, 2]], others, atol=0, rtol=0)
 

@@ -18,7 +18,7 @@ _CELL = 0.005  # of the base's longest half extent: how finely layers of splats 
 
 def object_size(boxes: Box) -> float:
     """About the radius of an object, world units: half the diagonal of its largest box."""
-    return float(boxes.half_extents.norm(dim=-1).max())
+    return float(boxes.half_extents.detach().norm(dim=-1).max())
 
 
 def tightened(parts: PosedParts) -> PosedParts:

@@ -113,9 +113,8 @@ class Fitter:
         if self.state.turns is not None:
             capture = capture.turned(self.state.turns)
         motions = laid_anew(variables.parts().detach(), capture.shifted(self.state.offset.detach()))
-        for k, motion in motions.items():
-            variables.set_motion(k, motion)
-            self.state.laid[k] = True
+        variables.set_motions(motions)
+        self.state.laid[list(motions)] = True
         if motions:
             yield Note(f"parts laid anew in their planes at step {self.state.step}: {', '.join(map(str, motions))}")
 
@@ -270,8 +269,7 @@ class Fitter:
         if state.step < config.laid_until * config.steps:
             variables.leaves["motions"][state.laid] = before[state.laid]
         if state.step < config.straight_until * config.steps:
-            for k, motion in held_along_base(variables.parts(), state.straight).items():
-                variables.set_motion(k, motion)
+            variables.set_motions(held_along_base(variables.parts(), state.straight))
 
     @torch.no_grad()
     def _adam(self) -> None:

@@ -28,9 +28,9 @@ def askew(parts: PosedParts, kinds: Sequence[JointKind]) -> Float[Tensor, ""]:
     """Sum over joints of the squared sine of the angle to the nearest axis of the base's box, no more than at 10 degrees.
 
     Drawers run square to what holds them and hinges lie along its edges, and the photos of a plain front say little about
-    either.  What slides by less than a thousandth of the base's half diagonal has no direction.
+    either.  What slides by less than a thousandth of the object's size has no direction.
     """
-    least = float(parts.boxes.half_extents[0].detach().norm()) / 1000
+    least = _MOVES * object_size(parts.boxes)
     axes, centres = parts.boxes.T_world_box.rotation[0].detach().T, parts.boxes.T_world_box.xyz.detach()
     total = axes.new_zeros(())
     for k, kind in enumerate(kinds, start=1):

@@ -1,6 +1,6 @@
 """The quantities that a fit changes, as leaves for the optimiser, and the posed parts that they make."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -71,17 +71,21 @@ class Variables:
             self.leaves["box_centres"].copy_(pose.xyz)
             self.leaves["log_half_extents"].copy_(boxes.half_extents.log())
 
-    def set_motion(self, k: int, motion: SE3) -> None:
-        """Sets the leaf so that part k has this motion, as closely as its joint, if it has one by now, lets it."""
-        motion = motion.to(self.start.device, torch.float64)
+    def set_motions(self, motions: Mapping[int, SE3]) -> None:
+        """Sets the leaf so that parts, by index, have these motions, as closely as their joints, if they have any, let them."""
+        if not motions:
+            return
         with torch.no_grad():
-            if self.kinds is None:
-                start, centre = SE3(self.start[k].double()), self.centres[k].double()
-                turn = motion @ start.inverse()
-                row = SE3.from_quat(turn.wxyz, turn.apply(centre) - centre).log()
-            else:
-                row = _joint_row(motion, self.kinds[k - 1], self.boxes(self.motions()).T_world_box.xyz[k])
-            self.leaves["motions"][k] = row.to(self.start)
+            places = self.boxes(self.motions()).T_world_box.xyz
+            for k, motion in motions.items():
+                motion = motion.to(self.start.device, torch.float64)
+                if self.kinds is None:
+                    start, centre = SE3(self.start[k].double()), self.centres[k].double()
+                    turn = motion @ start.inverse()
+                    row = SE3.from_quat(turn.wxyz, turn.apply(centre) - centre).log()
+                else:
+                    row = _joint_row(motion, self.kinds[k - 1], places[k])
+                self.leaves["motions"][k] = row.to(self.start)
 
     def motions(self) -> SE3:
         """The motions; the base's is the identity whatever its row says."""
