@@ -258,9 +258,13 @@ class Trial:
         """
         return self.weight * _HIDDEN * max(1 - hypothesis.seen / _SEEN_SHUT, 0.0)
 
+    def doubts(self, hypothesis: Hypothesis) -> float:
+        """What speaks against a judged hypothesis whatever the photos' errors, in mean error."""
+        return hypothesis.against(self.weight) + self.gone_in(hypothesis)
+
     def cost(self, hypothesis: Hypothesis, quick: bool = False) -> float:
         """What hypotheses are compared by: what speaks against them, less what they explain."""
-        return hypothesis.against(self.weight) + self.gone_in(hypothesis) - self.explained(hypothesis, quick)
+        return self.doubts(hypothesis) - self.explained(hypothesis, quick)
 
     def burden(self, hypothesis: Hypothesis) -> float:
         """What motions near each other are compared by: what speaks against them, and all of the photos' error.
@@ -268,7 +272,7 @@ class Trial:
         How much a part shows differs between the states' photos, the more so the fewer they are; what it takes off beyond its
         weight says nothing of where it is, but all of how exactly it lies there.
         """
-        return hypothesis.against(self.weight) + self.gone_in(hypothesis) + hypothesis.error
+        return self.doubts(hypothesis) + hypothesis.error
 
     def gain(self, hypothesis: Hypothesis) -> float:
         """Fraction that the part takes off the error of both states' photos."""
