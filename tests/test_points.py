@@ -219,6 +219,13 @@ class TestFaceAxes:
         points = surface_of((0.6, 0.4, 0.35), 3000, 0.004, 0)
         assert face_axes(points, np.eye(3), 0.01).tolist() == np.eye(3).tolist()
 
+    @pytest.mark.parametrize(("lies", "found"), [(0.0, 0.0), (0.7, 0.7)])
+    def test_the_world_s_axes_stand_for_those_that_are_near_and_as_sharp(self, lies: float, found: float):
+        true = Rotation.from_euler("xyz", [0, lies, 0], degrees=True).as_matrix()
+        points = surface_of((0.6, 0.4, 0.35), 3000, 0.004, 0) @ true.T
+        start = Rotation.from_euler("xyz", [0.1, lies + 0.2, -0.1], degrees=True).as_matrix()
+        assert turned_by(face_axes(points, start, 0.01), np.eye(3)) == pytest.approx(found, abs=0.3 if found else 0)
+
     def test_a_ball_has_none(self):
         points = np.random.default_rng(0).normal(size=(4000, 3))
         points /= np.linalg.norm(points, axis=1, keepdims=True)

@@ -12,6 +12,7 @@ _STARTS = 4  # of the turns at first, the best...
 _CLOSE = 4.5  # ...that are so many degrees apart, from which...
 _STEPS = (1.5, 0.8, 0.4, 0.2, 0.1, 0.05)  # ...turns of so many degrees climb
 _SHARPER = 1.03  # times: less is chance, or as good as it was
+_FRAME = 1.0  # degrees: the world's axes stand for those that are this near and not clearly sharper
 
 Axes = Float64[np.ndarray, "3 3"]
 
@@ -21,7 +22,8 @@ def face_axes(points: Float64[np.ndarray, "P 3"], start: Axes, cell: float) -> A
 
     The box of least volume lies askew where something sticks out at a corner.  Faces do not: seen along a face, its points
     are one peak in the histogram of their places.  The sum of the squares of the three axes' histograms is greatest where
-    most faces are seen so.  Where no other axes are clearly better, as of a ball, the given ones stay.
+    most faces are seen so.  Where no other axes are clearly better, as of a ball, the given ones stay; and so do the world's
+    where they are near: what was photographed on a turntable or in a simulator mostly stands along them.
 
     Args:
         points: of a surface, in the world.
@@ -37,7 +39,11 @@ def face_axes(points: Float64[np.ndarray, "P 3"], start: Axes, cell: float) -> A
         if len(starts) < _STARTS and all(_apart(axes, other) > _CLOSE for other in starts):
             starts.append(axes)
     best = max((_climbed(points, axes, cell) for axes in starts), key=lambda axes: _sharpness(points, axes, cell))
-    return best if _sharpness(points, best, cell) > _SHARPER * _sharpness(points, start, cell) else start
+    if _sharpness(points, best, cell) <= _SHARPER * _sharpness(points, start, cell):
+        best = start
+    world = np.round(best)
+    near = _apart(best, world) < _FRAME
+    return world if near and _sharpness(points, best, cell) <= _SHARPER * _sharpness(points, world, cell) else best
 
 
 def _climbed(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> Axes:
