@@ -76,15 +76,15 @@ class Variables:
         if not motions:
             return
         with torch.no_grad():
-            places = self.boxes(self.motions()).T_world_box.xyz
+            centres = self.centres if self.kinds is None else self.boxes(self.motions()).T_world_box.xyz
             for k, motion in motions.items():
                 motion = motion.to(self.start.device, torch.float64)
                 if self.kinds is None:
-                    start, centre = SE3(self.start[k].double()), self.centres[k].double()
+                    start, centre = SE3(self.start[k].double()), centres[k].double()
                     turn = motion @ start.inverse()
                     row = SE3.from_quat(turn.wxyz, turn.apply(centre) - centre).log()
                 else:
-                    row = _joint_row(motion, self.kinds[k - 1], places[k])
+                    row = _joint_row(motion, self.kinds[k - 1], centres[k])
                 self.leaves["motions"][k] = row.to(self.start)
 
     def motions(self) -> SE3:

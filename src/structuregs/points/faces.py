@@ -39,11 +39,10 @@ def face_axes(points: Float64[np.ndarray, "P 3"], start: Axes, cell: float) -> A
         if len(starts) < _STARTS and all(_apart(axes, other) > _CLOSE for other in starts):
             starts.append(axes)
     best = max((_climbed(points, axes, cell) for axes in starts), key=lambda axes: _sharpness(points, axes, cell))
-    if _sharpness(points, best, cell) <= _SHARPER * _sharpness(points, start, cell):
+    if not _clearly_sharper(points, best, start, cell):
         best = start
     world = np.round(best)
-    near = _apart(best, world) < _FRAME
-    return world if near and _sharpness(points, best, cell) <= _SHARPER * _sharpness(points, world, cell) else best
+    return world if _apart(best, world) < _FRAME and not _clearly_sharper(points, best, world, cell) else best
 
 
 def _climbed(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> Axes:
@@ -68,6 +67,11 @@ def _turns(degrees: Float64[np.ndarray, " T"]) -> list[Axes]:
 def _apart(one: Axes, other: Axes) -> float:
     """Degrees between two rotations."""
     return float(np.degrees(Rotation.from_matrix(one.T @ other).magnitude()))
+
+
+def _clearly_sharper(points: Float64[np.ndarray, "P 3"], one: Axes, other: Axes, cell: float) -> bool:
+    """Whether layers are sharper across the one axes than across the other by more than chance."""
+    return _sharpness(points, one, cell) > _SHARPER * _sharpness(points, other, cell)
 
 
 def _sharpness(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> float:
