@@ -226,6 +226,12 @@ class TestFaceAxes:
         start = Rotation.from_euler("xyz", [0.1, lies + 0.2, -0.1], degrees=True).as_matrix()
         assert turned_by(face_axes(points, start, 0.01), np.eye(3)) == pytest.approx(found, abs=0.3 if found else 0)
 
+    def test_what_stands_at_45_degrees_is_far_from_the_world_s_axes(self):
+        true = Rotation.from_euler("xyz", [0, 0, 45], degrees=True).as_matrix()
+        found = face_axes(surface_of((0.6, 0.4, 0.35), 3000, 0.004, 0) @ true.T, true, 0.01)
+        np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-9)
+        assert turned_by(found, true) < 0.3
+
     def test_a_ball_has_none(self):
         points = np.random.default_rng(0).normal(size=(4000, 3))
         points /= np.linalg.norm(points, axis=1, keepdims=True)

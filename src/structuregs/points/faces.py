@@ -41,8 +41,9 @@ def face_axes(points: Float64[np.ndarray, "P 3"], start: Axes, cell: float) -> A
     best = max((_climbed(points, axes, cell) for axes in starts), key=lambda axes: _sharpness(points, axes, cell))
     if not _clearly_sharper(points, best, start, cell):
         best = start
-    world = np.round(best)
-    return world if _apart(best, world) < _FRAME and not _clearly_sharper(points, best, world, cell) else best
+    world = np.round(best)  # signed axes of the world, if the best are near any; at 45 degrees it is no rotation
+    near = np.abs(world).sum() == 3 and _apart(best, world) < _FRAME
+    return world if near and not _clearly_sharper(points, best, world, cell) else best
 
 
 def _climbed(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> Axes:
