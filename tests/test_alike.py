@@ -90,8 +90,10 @@ def test_a_further_motion_is_that_of_the_world_in_the_other_state():
 @pytest.mark.parametrize("place", [(1.5, 0.0, 0.0), (-1.0, 2.0, 0.0), (1.0, -1.0, 1.5), (5.5, -2.0, 0.0)])
 def test_a_face_is_laid_where_its_photos_are_alike(place: tuple[float, float, float]):
     wrong = beside(*place)
-    found = Face.most_shown(overlap(wrong)).laid_alike()
-    assert found is not None
+    face = Face.most_shown(overlap(wrong))
+    at = face.alike_at()
+    assert at is not None
+    found = face.laid(at)
     error = (found.apply(BOX.corners) - TRUE.apply(BOX.corners)).norm(dim=-1)
     before = (wrong.apply(BOX.corners) - TRUE.apply(BOX.corners)).norm(dim=-1)
     assert float(error.max()) < 0.25 * UNIT < 0.2 * float(before.max())
@@ -108,7 +110,7 @@ def test_a_face_goes_in_its_plane_only():
 def test_a_plain_face_tells_nothing():
     plain = overlap(beside(1.5, 0, 0), pattern=PLAIN)
     assert plain.unlike() == 1
-    assert Face.most_shown(plain).laid_alike() is None
+    assert Face.most_shown(plain).alike_at() is None
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -117,7 +119,7 @@ def test_photos_that_show_something_else_tell_nothing(seed: int):
     other = np.random.default_rng(seed).uniform(0.2, 0.8, PATCHES.shape)
     found = Overlap.between(shown(board(PATCHES)), shown(board(other).moved(TRUE)), TRUE, BOX, UNIT)
     assert found.unlike() > 0.9
-    assert Face.most_shown(found).laid_alike() is None
+    assert Face.most_shown(found).alike_at() is None
 
 
 def test_a_place_stands_out_to_every_side(monkeypatch):
@@ -130,18 +132,18 @@ def test_a_place_stands_out_to_every_side(monkeypatch):
 
 
 def test_a_face_that_is_where_it_was_found_stays():
-    assert Face.most_shown(overlap(TRUE)).laid_alike() is None
+    assert Face.most_shown(overlap(TRUE)).alike_at() is None
 
 
 def test_what_is_out_of_reach_is_not_found():
-    assert Face.most_shown(overlap(beside(16, 0, 0))).laid_alike() is None
+    assert Face.most_shown(overlap(beside(16, 0, 0))).alike_at() is None
 
 
 def test_what_no_photo_shows_in_both_states_is_no_overlap():
     away = overlap(SE3.exp(torch.tensor([0, 0, 1.0, 0, 0, 0], dtype=F64)) @ TRUE)
     assert len(away) == 0
     assert away.unlike() == 1
-    assert Face.most_shown(away).laid_alike() is None
+    assert Face.most_shown(away).alike_at() is None
 
 
 def test_pixels_lie_on_the_part_in_the_state_they_are_of():
@@ -201,6 +203,16 @@ def test_a_part_whose_photos_are_not_alike_asks_for_a_look():
     assert joint.review == "Where the part lies in either state, photos of the two do not look alike."
 
 
+def test_a_part_whose_photos_are_more_alike_beside_it_asks_for_a_look():
+    true = with_a_base(slide(0.0), PATCHES)
+    capture = photographed(true)
+    assert alike_in_both(true, capture).joints == true.joints
+    aside = with_a_base(slide(0.05), PATCHES)
+    (joint,) = alike_in_both(aside, capture).joints
+    assert joint.confidence < 0.75 * aside.joints[0].confidence
+    assert joint.review == "Photos of the two states look more alike with the part 0.05 aside, in its face's plane."
+
+
 def test_a_fitted_part_that_lies_beside_its_place_is_laid_anew():
     true = with_a_base(slide(0.0), PATCHES)
     laid = laid_anew(with_a_base(slide(0.05), PATCHES).parts, photographed(true))
@@ -209,6 +221,17 @@ def test_a_fitted_part_that_lies_beside_its_place_is_laid_anew():
     torch.testing.assert_close(laid[1].apply(corners), slide(0.0).apply(corners), atol=0.005, rtol=0)
 
 
-def test_a_fitted_part_that_looks_the_same_all_over_stays():
+def test_a_plain_part_is_laid_by_what_shows_beside_it():
+    """Where state 1 shows the background in its place, and state 0 does so beside it."""
     capture = photographed(with_a_base(slide(0.0), PLAIN))
-    assert laid_anew(with_a_base(slide(0.05), PLAIN).parts, capture) == {}
+    aside = with_a_base(slide(0.05), PLAIN)
+    laid = laid_anew(aside.parts, capture)
+    corners = aside.parts.boxes.corners[1].double()
+    torch.testing.assert_close(laid[1].apply(corners), slide(0.0).apply(corners), atol=0.005, rtol=0)
+
+
+def test_a_fitted_part_stays_where_either_state_shows_something_else():
+    other = np.random.default_rng(1).uniform(0.2, 0.8, PATCHES.shape)
+    one, two = (photographed(with_a_base(slide(0.0), pattern)) for pattern in (PATCHES, other))
+    capture = replace(one, train=(one.train[0], two.train[1]), test=(one.test[0], two.test[1]))
+    assert laid_anew(with_a_base(slide(0.05), PATCHES).parts, capture) == {}

@@ -449,10 +449,10 @@ class TestOptimiser:
         list(fit.run(21))
         assert not torch.equal(fit.state.variables.motions().wxyz_xyz, start)
 
-    def test_a_part_that_was_laid_anew_rests_while_the_others_move(self):
-        fit = fitter(replace(QUICK, laid_until=0.5, straight_until=0.0))
-        fit.state.laid[1] = True
+    def test_a_part_that_was_laid_anew_rests_while_the_others_move(self, monkeypatch):
+        fit = fitter(replace(QUICK, lay_at=(0.0,), laid_rest=0.5, straight_until=0.0))
         start = fit.state.variables.motions().wxyz_xyz.detach().clone()
+        monkeypatch.setattr("structuregs.fit.loop.laid_anew", lambda *_: {1: SE3(start[1])})
         list(fit.run(20))
         now = fit.state.variables.motions().wxyz_xyz
         assert torch.equal(now[1], start[1])
@@ -460,12 +460,23 @@ class TestOptimiser:
         list(fit.run(21))
         assert not torch.equal(fit.state.variables.motions().wxyz_xyz[1], start[1])
 
+    def test_only_what_was_laid_last_rests(self, monkeypatch):
+        fit = fitter(replace(QUICK, lay_at=(0.0, 0.5), laid_rest=0.5, straight_until=0.0, one_joint_from=1.0))
+        for part, until in ((1, 20), (2, 21)):
+            monkeypatch.setattr("structuregs.fit.loop.laid_anew", lambda parts, _, k=part: {k: SE3(parts.motions.wxyz_xyz[k])})
+            list(fit.run(until))
+        before = fit.state.variables.motions().wxyz_xyz.detach().clone()
+        list(fit.run(25))
+        now = fit.state.variables.motions().wxyz_xyz
+        assert torch.equal(now[2], before[2])
+        assert not torch.equal(now[1], before[1])
+
     @pytest.mark.parametrize("one_joint_from", [0.2, 1.0])
     def test_a_joint_along_the_base_stays_so_until_its_time_has_come(self, one_joint_from: float):
         """Its photos see the drawer come out askew."""
         straight = made_of(DOOR.motion(), SE3.from_quat(SE3.identity().wxyz, torch.tensor([0.0, -0.4, 0.0]))).parts
         askew_drawer = SE3.from_quat(SE3.identity().wxyz, torch.tensor([0.03, -0.4, 0.0]))
-        config = replace(QUICK, along_base=0.0, straight_until=0.5, lay_at=1.0, square_at=(), one_joint_from=one_joint_from)
+        config = replace(QUICK, along_base=0.0, straight_until=0.5, lay_at=(), square_at=(), one_joint_from=one_joint_from)
         capture = photographed(made_of(DOOR.motion(), askew_drawer))
         fit = Fitter(capture, config, FitState.start(straight), 0, torch.device("cpu"))
         assert fit.state.straight.tolist() == [False, True, True]

@@ -278,11 +278,16 @@ class Face:
         every = max(len(self.overlap) // most, 1)
         return self if every == 1 else replace(self, overlap=self.overlap.of(np.arange(len(self.overlap)) % every == 0))
 
-    def laid_alike(self) -> SE3 | None:
-        """The motion of the part with the face where its photos are alike.
+    def laid(self, place: Float64[np.ndarray, " 3"]) -> SE3:
+        """The motion of the part with the face at a place."""
+        return self.moved(place) @ self.overlap.motion
 
-        None where it says no better: a face may tell nothing, or light make it look another way.  Either half of the photos has
-        to find the place, what the one half finds has to make the other more alike, and around it photos have to be less alike.
+    def alike_at(self) -> Float64[np.ndarray, " 3"] | None:
+        """The place where the photos of the face are alike.
+
+        None where they say no better: a face may tell nothing, or light make it look another way.  Either half of the photos
+        has to find the place, what the one half finds has to make the other more alike, and around it photos have to be less
+        alike.
         """
         halves = [Face(self.overlap.of(self.overlap.pixels[:, 0] % 2 == odd), self.pose) for odd in (0, 1)]
         if min(len(half.overlap) for half in halves) < _FEWEST:
@@ -297,7 +302,7 @@ class Face:
             left, place = left_turned, self.turned(place)
         if left > _BETTER or self.unlike(place) > _ALIKE or not self.stands_out(place):
             return None
-        return self.moved(place) @ self.overlap.motion
+        return place
 
 
 def _left_of_each_other(halves: Sequence[Face], places: Sequence[Float64[np.ndarray, " 3"]]) -> float:

@@ -277,8 +277,9 @@ class PartReview:
         pieces, here, there = self.pieces, self.pieces.looks[part.state], self.pieces.looks[1 - part.state]
         own, other = Shown(here.stack, here.splats, pieces.held_by_part(part)), Shown(there.stack, there.splats, None)
         overlap = Overlap.between(own, other, part.hypothesis.motion, pieces.box(part.points), pieces.voxel)
-        motion = Face.most_shown(overlap).laid_alike()
-        return part if motion is None else replace(part, hypothesis=replace(part.hypothesis, motion=motion))
+        face = Face.most_shown(overlap)
+        place = face.alike_at()
+        return part if place is None else replace(part, hypothesis=replace(part.hypothesis, motion=face.laid(place)))
 
     def _merged(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> list[MovingPart]:
         """The parts with two of them made one, which moves as the leader does."""

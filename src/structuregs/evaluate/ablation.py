@@ -19,7 +19,7 @@ def ablations(capture: Capture, config: FitConfig, folder: Path, seed: int) -> l
         "free_joints": ("motions not held to one degree of freedom", replace(config, one_joint_from=1.0)),
         "free_axes": ("joints not drawn to the base's axes", replace(config, along_base=0.0, straight_until=0.0)),
         "never_held": ("joints that begin along the base not kept there", replace(config, straight_until=0.0)),
-        "never_laid": ("parts not laid anew on the way", replace(config, lay_at=1.0)),
+        "never_laid": ("parts not laid anew on the way", replace(config, lay_at=())),
         "no_surface": (
             "no losses on surfaces",
             replace(config, planarity_weight=0.0, opacity_penalty=0.0, thickness_penalty=0.0),

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy import ndimage
 from torch import Tensor
 
+from ..boxes import Face, Overlap
 from ..capture import Capture, ImageStack, spread_cameras, stack_views
 from ..geometry import Camera
 from ..joints import REVIEW_BELOW
@@ -27,6 +28,7 @@ _RIM, _BESIDE = 0.003, 0.012  # of the pixels that a part covers: the same of pi
 _LOOK = 400  # side of a square with as many pixels as the pictures that tell
 _LOOKS = 48  # of either state
 _FEWEST = 50  # pixels that say something
+_HARDLY, _ASIDE = 0.5, 2.0  # units: so far away photos may be more alike; so much farther leaves no confidence
 _NOTHING = 0.4  # photos that leave so much more unexplained of each other than nothing would say that a part is elsewhere
 
 
@@ -191,8 +193,10 @@ def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject
 
     Photos of one state are laid upon those of the other, as the model says where each pixel went.  They leave at most as much
     of what varies unexplained as if nothing were laid there; where they leave more than that, what one state shows is not
-    where the other has it.  The factor is 1 up to there, 0 from 1.4 times that on, of the worse of both directions; where
-    that makes a joint doubtful, a sentence asks for a look.  Parts that no photos of both states show say nothing.
+    where the other has it.  The factor is 1 up to there, 0 from 1.4 times that on, of the worse of both directions.  A second
+    one is 1 where photos are alike, or no place in the plane of the part's face where they are more so stands out; 0 where
+    such a place lies 2.5 units away (as `Face.alike_at` finds it; .3 at most of parts that are right).  Where that makes a
+    joint doubtful, a sentence asks for a look.  Parts that no photos of both states show say nothing.
 
     Args:
         obj: as fitted.
@@ -200,11 +204,25 @@ def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject
     """
     both, joints = BothStates(obj.parts, capture), []
     for k, joint in enumerate(obj.joints, start=1):
-        left = [overlap.unlike() for overlap in (both.laid(k, s) for s in (0, 1)) if len(overlap) > _FEWEST]
-        score = _score(max(left, default=0.0), 1.0, _NOTHING)
-        sentence = "Where the part lies in either state, photos of the two do not look alike."
-        joints.append(_lowered(joint, score, sentence))
+        overlaps = [overlap for overlap in (both.laid(k, s) for s in (0, 1)) if len(overlap) > _FEWEST]
+        left = max((overlap.unlike() for overlap in overlaps), default=0.0)
+        away = max(map(_better_place, overlaps), default=0.0)
+        for score, sentence in (
+            (_score(left, 1.0, _NOTHING), "Where the part lies in either state, photos of the two do not look alike."),
+            (
+                _score(away, _HARDLY, _ASIDE),
+                f"Photos of the two states look more alike with the part {away * both.unit:.2g} aside, in its face's plane.",
+            ),
+        ):
+            joint = _lowered(joint, score, sentence)
+        joints.append(joint)
     return replace(obj, joints=tuple(joints))
+
+
+def _better_place(overlap: Overlap) -> float:
+    """How many units away photos of the two states are clearly more alike; 0 where no such place is found."""
+    place = Face.most_shown(overlap).alike_at()
+    return 0.0 if place is None else float(np.linalg.norm(place))
 
 
 def _lowered(joint: Joint, score: float, sentence: str) -> Joint:

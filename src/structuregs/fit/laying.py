@@ -19,10 +19,14 @@ class BothStates:
     Args:
         parts: as fitted so far.
         capture: what they are fitted to, its cameras as the fit has put them right.
+
+    Attributes:
+        unit: how exactly surfaces are known, world units.
     """
 
     def __init__(self, parts: PosedParts, capture: Capture):
         self.parts = parts.to(torch.device("cpu"))
+        self.unit = _EXACT * object_size(parts.boxes)
         self._stacks = [
             stack_views([views[v] for v in spread_cameras([view.camera for view in views], _PHOTOS)], _SIZE)
             for views in capture.train
@@ -37,7 +41,7 @@ class BothStates:
             self._shown = {k: shown}  # photos of one part are asked at a time, and take room
         motion, box = SE3(parts.motions.wxyz_xyz[k].double()), Box(SE3(pose.double()), parts.boxes.half_extents[k].double())
         way, own = (motion.inverse(), box.moved(motion)) if state else (motion, box)
-        return Overlap.between(self._shown[k][state], self._shown[k][1 - state], way, own, _EXACT * object_size(parts.boxes))
+        return Overlap.between(self._shown[k][state], self._shown[k][1 - state], way, own, self.unit)
 
 
 @torch.no_grad()
@@ -52,5 +56,17 @@ def laid_anew(parts: PosedParts, capture: Capture) -> dict[int, SE3]:
         capture: what they are fitted to, its cameras as the fit has put them right.
     """
     both = BothStates(parts, capture)
-    motions = {k: Face.most_shown(both.laid(k, 0)).laid_alike() for k in range(1, len(parts))}
+    motions = {k: _laid(both, k) for k in range(1, len(parts))}
     return {k: motion for k, motion in motions.items() if motion is not None}
+
+
+def _laid(both: BothStates, k: int) -> SE3 | None:
+    """The motion of part k where photos of either state laid upon those of the other are alike, whichever are more so."""
+    laid = []
+    for state in (0, 1):
+        face = Face.most_shown(both.laid(k, state))
+        place = face.alike_at()
+        if place is not None:
+            motion = face.laid(place)
+            laid.append((face.unlike(place), motion.inverse() if state else motion))
+    return min(laid, key=lambda found: found[0])[1] if laid else None

@@ -59,7 +59,7 @@ class Fitter:
                 yield from self._aim_cameras()
             if self.state.step in [round(at * self.config.steps) for at in self.config.square_at]:
                 self._square_up()
-            if self.state.step == round(self.config.lay_at * self.config.steps):
+            if self.state.step in [round(at * self.config.steps) for at in self.config.lay_at]:
                 yield from self._lay_anew()
             yield from self._settle_joints()
             loss, psnr = self._step()
@@ -114,6 +114,7 @@ class Fitter:
             capture = capture.turned(self.state.turns)
         motions = laid_anew(variables.parts().detach(), capture.shifted(self.state.offset.detach()))
         variables.set_motions(motions)
+        self.state.laid[:] = False
         self.state.laid[list(motions)] = True
         if motions:
             yield Note(f"parts laid anew in their planes at step {self.state.step}: {', '.join(map(str, motions))}")
@@ -266,7 +267,7 @@ class Fitter:
         self._adam()
         if not self._rate("motions"):
             return
-        if state.step < config.laid_until * config.steps:
+        if any(0 <= state.step - round(at * config.steps) < config.laid_rest * config.steps for at in config.lay_at):
             variables.leaves["motions"][state.laid] = before[state.laid]
         if state.step < config.straight_until * config.steps:
             variables.set_motions(held_along_base(variables.parts(), state.straight))

@@ -116,11 +116,10 @@ class FitConfig:
     """Part of the fit after which faces are made plane: what is hollow has to be found hollow before."""
     planarity_size: int = 160
     """Size of the images that it is taken from: the side of a square with as many pixels."""
-    lay_at: float = 0.35
-    """Part of the fit after which parts are laid anew in the plane of their face, where photos of both states are alike; 1 for
-    never."""
-    laid_until: float = 0.5
-    """Part of the fit up to which the motions of those parts then rest, until splats have forgotten where they were before."""
+    lay_at: tuple[float, ...] = (0.35, 0.7)
+    """Parts of the fit after which parts are laid anew in the plane of their face, where photos of both states are alike."""
+    laid_rest: float = 0.15
+    """Part of the fit for which the motions of those parts then rest, until splats have forgotten where they were before."""
     along_base: float = 1.0
     """Of the squared sine of the angle between a joint's axis and the nearest one of the base's box, where that is small.  At
     the end joints that photos do not tell from ones along the base go along it.  0 for neither."""
@@ -179,7 +178,7 @@ PRESETS: dict[str, FitConfig] = {
         along_base=0.0,
         square_at=(),
         join_at=1.0,
-        lay_at=1.0,
+        lay_at=(),
         straight_until=0.0,
         one_joint_from=1.0,
         checkpoint_every=500,

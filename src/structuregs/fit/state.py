@@ -36,7 +36,7 @@ class FitState:
         turns: by which the training cameras of either state were turned (see `Camera.turned`); None where they were right.
         anew: whether the fit has begun with the cameras already turned.
         straight: which parts' joints lay along the base's box at the start.
-        laid: which parts have been laid anew.
+        laid: which parts have been laid anew last.
     """
 
     variables: Variables
