@@ -194,9 +194,9 @@ def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject
     Photos of one state are laid upon those of the other, as the model says where each pixel went.  They leave at most as much
     of what varies unexplained as if nothing were laid there; where they leave more than that, what one state shows is not
     where the other has it.  The factor is 1 up to there, 0 from 1.4 times that on, of the worse of both directions.  A second
-    one is 1 where photos are alike, or no place in the plane of the part's face where they are more so stands out; 0 where
-    such a place lies 2.5 units away (as `Face.alike_at` finds it; .3 at most of parts that are right).  Where that makes a
-    joint doubtful, a sentence asks for a look.  Parts that no photos of both states show say nothing.
+    one is 1 unless photos are clearly more alike with the part elsewhere in the plane of its face (`Face.alike_at`), more than
+    half a unit away (.7 at most of parts that are clearly right), and 0 from 2.5 units on.  Where that makes a joint doubtful,
+    a sentence asks for a look.  Parts that no photos of both states show say nothing.
 
     Args:
         obj: as fitted.
@@ -207,15 +207,10 @@ def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject
         overlaps = [overlap for overlap in (both.laid(k, s) for s in (0, 1)) if len(overlap) > _FEWEST]
         left = max((overlap.unlike() for overlap in overlaps), default=0.0)
         away = max(map(_better_place, overlaps), default=0.0)
-        for score, sentence in (
-            (_score(left, 1.0, _NOTHING), "Where the part lies in either state, photos of the two do not look alike."),
-            (
-                _score(away, _HARDLY, _ASIDE),
-                f"Photos of the two states look more alike with the part {away * both.unit:.2g} aside, in its face's plane.",
-            ),
-        ):
-            joint = _lowered(joint, score, sentence)
-        joints.append(joint)
+        unlike = "Where the part lies in either state, photos of the two do not look alike."
+        aside = f"Photos of the two states look more alike with the part {away * both.unit:.2g} aside, in its face's plane."
+        joint = _lowered(joint, _score(left, 1.0, _NOTHING), unlike)
+        joints.append(_lowered(joint, _score(away, _HARDLY, _ASIDE), aside))
     return replace(obj, joints=tuple(joints))
 
 

@@ -52,14 +52,14 @@ class Fitter:
     def run(self, steps: int) -> Iterator[FitEvent]:
         """Takes steps until `steps` are done; yields a `Step` now and then."""
         while self.state.step < min(steps, self.config.steps):
-            if self.state.step == round(self.config.join_at * self.config.steps):
+            if self._is_at(self.config.join_at):
                 yield from self._merge_parts()
             aiming = max(round(self.config.aim_at * self.config.steps), self.config.image_from + 1)
             if self.state.step == aiming and self.state.turns is None:
                 yield from self._aim_cameras()
-            if self.state.step in [round(at * self.config.steps) for at in self.config.square_at]:
+            if self._is_at(*self.config.square_at):
                 self._square_up()
-            if self.state.step in [round(at * self.config.steps) for at in self.config.lay_at]:
+            if self._is_at(*self.config.lay_at):
                 yield from self._lay_anew()
             yield from self._settle_joints()
             loss, psnr = self._step()
@@ -67,6 +67,10 @@ class Fitter:
             self.state.step += 1
             if self.state.step % _REPORT_EVERY == 0:
                 yield Step("fit", self.state.step, loss, psnr, sum(self.state.variables.counts))
+
+    def _is_at(self, *times: float) -> bool:
+        """Whether the fit is at the step that one of these parts of it ends with."""
+        return self.state.step in [round(at * self.config.steps) for at in times]
 
     def _merge_parts(self) -> Iterator[FitEvent]:
         """Makes one part of two that touch and move alike, and leaves to the base what need not move."""
