@@ -465,11 +465,10 @@ class TestParts:
         assert gap < 0.05
         assert part.gain > 0.02
 
-    @pytest.mark.parametrize("views", [24, 32])
-    def test_a_door_and_a_drawer_both_shut_are_found(self, views: int):
+    def test_a_door_and_a_drawer_both_shut_are_found(self):
         obj = make_object("cabinet")
         # In even light: where a door looks quite another colour once it is open, so few photos do not tell its angle.
-        options = RenderOptions(size=200, views=views, test_views=1, samples=2, lighting=Lighting(ambient=0.75))
+        options = RenderOptions(size=200, views=32, test_views=1, samples=2, lighting=Lighting(ambient=0.75))
         config = StartConfig(appearance=AppearanceConfig(steps=300))
         looks = survey(make_capture(obj, options), None, config, seed=0)
         parts = find_parts(looks, None, config, seed=0)
@@ -504,6 +503,40 @@ class TestParts:
         assert len(found) == len(clusters(looks, SMALL.search.cue)) + 1
         kept = PartSearch((haunted, looks[1]), SMALL.search, seed=0)
         assert [len(c.points) for c in kept.pieces.clusters] == [len(c.points) for c in search.pieces.clusters]
+
+    def test_points_in_the_air_with_hardly_a_splat_are_no_part(self):
+        """However much photos need of the little that is painted there."""
+        looks = looks_of("laptop")[1]
+        pieces = Pieces(looks, SMALL.search, seed=0)
+        (largest, *_), (held, *_) = pieces.clusters, pieces.held
+        look = looks[largest.state]
+        left = torch.ones(len(look.splats), dtype=torch.bool)
+        left[held.nonzero()[3:]] = False
+        emptied = [replace(look, splats=look.splats[left]) if s == largest.state else looks[s] for s in (0, 1)]
+        after = Pieces((emptied[0], emptied[1]), SMALL.search, seed=0)
+        scene, few = pieces.scene(largest.state, look.splats[~held]), look.splats[left & held]
+        weight = scene.absent - scene.error(few, NO_MOTION)
+        assert weight > SMALL.search.there * scene.footprint(few) > 0
+        assert all(cluster.state != largest.state for cluster in after.clusters)
+
+    @pytest.mark.parametrize(("voxels", "kept"), [(0.8, 0), (3.0, 1)])
+    def test_what_goes_nowhere_is_no_part(self, monkeypatch: pytest.MonkeyPatch, voxels: float, kept: int):
+        looks = looks_of("laptop")[1]
+        search = PartSearch(looks, SMALL.search, seed=0)
+        slide = Screw("prismatic", torch.tensor([1.0, 0, 0], dtype=F64), torch.zeros(3, dtype=F64))
+
+        def little(index: int, *_):
+            cluster, rest = search.pieces.clusters[index], search.pieces.splats_in({index})
+            trial = search.pieces.trial(cluster.state, cluster.points, rest, search.pieces.weights[index], [])
+            found = trial.judge(Hypothesis(slide.motion(voxels * search.pieces.voxel), 0.0, 0.0, 0.0))
+            part = MovingPart(cluster.state, (cluster.points,), found, 0.5, trial.weight)  # a gain that nothing else gainsays
+            return part, set(range(len(search.pieces))), trial
+
+        monkeypatch.setattr(search, "_try", little)
+        monkeypatch.setattr("structuregs.boxes.partition.several_in", lambda part, *_: [part.points])
+        monkeypatch.setattr("structuregs.boxes.partition.is_unclear", lambda *_: False)
+        monkeypatch.setattr(search.review, "reviewed", list)
+        assert len(search.search(None)) == kept
 
     def test_where_everything_seems_to_move_it_still_ends(self):
         looks = looks_of("laptop")[1]

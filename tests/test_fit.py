@@ -818,6 +818,18 @@ class TestResult:
         assert unclear.joints[0].axis == clear.joints[0].axis
 
 
+@pytest.mark.parametrize("settled", [True, False])
+def test_a_part_without_splats_is_none(settled: bool):
+    left = DOOR_AND_DRAWER.splats[DOOR_AND_DRAWER.part != 1]
+    parts = replace(DOOR_AND_DRAWER, splats=left, counts=(120, 0, 120), tint=torch.zeros(240, 3))
+    state = FitState.start(parts)
+    if settled:
+        state.variables.hold(["revolute", "prismatic"])
+    (drawer,) = finished_object(state).joints
+    whole = finished_object(FitState.start(DOOR_AND_DRAWER))
+    assert drawer == whole.joints[1]
+
+
 RECORD = {"capture": "here", "seed": 0, "fit": {"steps": 3, "sizes": ((0.0, 10),)}}
 
 

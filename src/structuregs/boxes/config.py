@@ -40,6 +40,9 @@ class SearchConfig:
     there: float = 0.12
     """A cluster whose absence costs the photos of its own state less than this, in mean error of the pixels that show it, is
     no surface, but splats in the air before one that few views see; surfaces come out at .15 to 1, these below .1."""
+    painted: float = 0.05
+    """A cluster that paints less of its own state's photos than this times its share of the state's points is no surface, but
+    points in the air where there are hardly any splats; surfaces come out at .4 and more, these below .015."""
     clear: float = 3.0
     """Splats this near to a cluster's box, in voxels, belong to it."""
     shortlist: int = 110

@@ -112,12 +112,14 @@ class Pieces:
         return max(rows, key=len) if any(map(len, rows)) else self.looks[0].points
 
     def take(self, cluster: Cluster) -> None:
-        """Takes a cluster among those to explain, if the photos of its own state need it where they show it."""
-        splats = self.looks[cluster.state].splats
+        """Takes a cluster among those to explain, if the photos of its own state show it, and need it where they do."""
+        look = self.looks[cluster.state]
+        splats = look.splats
         held = self.held_by(cluster.points, cluster.state)
         scene, piece = self.scene(cluster.state, splats[~held]), splats[held]
         weight = scene.absent - scene.error(piece, SE3.identity(dtype=torch.float64))
-        if weight > self.config.there * scene.footprint(piece):
+        footprint, share = scene.footprint(piece), len(cluster.points) / len(look.points)
+        if footprint > self.config.painted * share and weight > self.config.there * footprint:
             self.clusters.append(cluster)
             self.boxes.append(self.box(cluster.points))
             self.held.append(held)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..boxes import MovingPart, PartSearch, boxes_at_rest, boxes_of_parts, look_at_states, seeded, strewn
 from ..capture import Capture
-from ..geometry import SE3
+from ..geometry import SE3, JointKind
 from ..joints import articulate, joints_of
 from ..model import ArticulatedObject, PosedParts, load_object, save_object
 from ..points import points_from
@@ -94,14 +94,20 @@ def _searched(search: PartSearch) -> Generator[FitEvent, None, list[MovingPart]]
 def finished_object(state: FitState) -> ArticulatedObject:
     """The object of a fit that has taken its last step.
 
-    A joint is no clearer than it was while its motion was still free: the lower confidence of the two stands.
+    A moving part that has no splats left was in the air, and is none.  A joint is no clearer than it was while its motion was
+    still free: the lower confidence of the two stands.
     """
-    with torch.no_grad():
-        parts = tightened(state.variables.parts())
-    obj = articulate(parts, state.variables.kinds)
+    parts = state.variables.parts().detach()
+    left = [k for k, count in enumerate(parts.counts) if k == 0 or count]
+    for k in reversed(range(len(parts))):
+        if k not in left:
+            parts = parts.joined(0, k)
+    parts = tightened(parts)
     if state.variables.kinds is None:
-        return obj
-    free = joints_of(replace(parts, motions=SE3(state.free_motions)), state.variables.kinds)
+        return articulate(parts)
+    kinds: list[JointKind] = [state.variables.kinds[k - 1] for k in left[1:]]
+    obj = articulate(parts, kinds)
+    free = joints_of(replace(parts, motions=SE3(state.free_motions[left])), kinds)
     joints = [
         replace(joint, confidence=before.confidence, review=joint.review or before.review)
         if before.confidence < joint.confidence
