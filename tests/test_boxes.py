@@ -519,25 +519,6 @@ class TestParts:
         assert weight > SMALL.search.there * scene.footprint(few) > 0
         assert all(cluster.state != largest.state for cluster in after.clusters)
 
-    @pytest.mark.parametrize(("voxels", "kept"), [(0.8, 0), (3.0, 1)])
-    def test_what_goes_nowhere_is_no_part(self, monkeypatch: pytest.MonkeyPatch, voxels: float, kept: int):
-        looks = looks_of("laptop")[1]
-        search = PartSearch(looks, SMALL.search, seed=0)
-        slide = Screw("prismatic", torch.tensor([1.0, 0, 0], dtype=F64), torch.zeros(3, dtype=F64))
-
-        def little(index: int, *_):
-            cluster, rest = search.pieces.clusters[index], search.pieces.splats_in({index})
-            trial = search.pieces.trial(cluster.state, cluster.points, rest, search.pieces.weights[index], [])
-            found = trial.judge(Hypothesis(slide.motion(voxels * search.pieces.voxel), 0.0, 0.0, 0.0))
-            part = MovingPart(cluster.state, (cluster.points,), found, 0.5, trial.weight)  # a gain that nothing else gainsays
-            return part, set(range(len(search.pieces))), trial
-
-        monkeypatch.setattr(search, "_try", little)
-        monkeypatch.setattr("structuregs.boxes.partition.several_in", lambda part, *_: [part.points])
-        monkeypatch.setattr("structuregs.boxes.partition.is_unclear", lambda *_: False)
-        monkeypatch.setattr(search.review, "reviewed", list)
-        assert len(search.search(None)) == kept
-
     def test_where_everything_seems_to_move_it_still_ends(self):
         looks = looks_of("laptop")[1]
         everywhere = CueConfig(threshold=-1e3, neighbours=16)  # every point is further from the other state than that
@@ -802,6 +783,13 @@ class TestReview:
             (kept,) = review.without_doubles(parts)
             assert kept is right
         assert review.without_doubles([right]) == [right]
+
+    @pytest.mark.parametrize(("voxels", "kept"), [(1.4, 0), (1.6, 1)])
+    def test_what_goes_no_farther_than_still_points_may_lie_is_no_part(self, voxels: float, kept: int):
+        review, right, wrong = self.found()
+        slide = Screw("prismatic", torch.tensor([1.0, 0, 0], dtype=F64), torch.zeros(3, dtype=F64))
+        idle = replace(right, hypothesis=replace(right.hypothesis, motion=slide.motion(voxels * review.pieces.voxel)))
+        assert review.going_somewhere([right, idle, wrong]) == [right, *[idle] * kept, wrong]
 
     def test_what_lies_in_a_larger_part_s_box_goes_unless_it_explains_what_it_should(self):
         review = PartReview(Pieces(looks_of("cabinet")[1], SMALL.search, seed=0))

@@ -111,14 +111,6 @@ class PartSearch:
         found.update(takers)
         return left
 
-    def _goes_anywhere(self, part: MovingPart) -> bool:
-        """Whether a part's motion carries some of it farther than a voxel.
-
-        What moved was found that far from all that the other state has; what stays nearer to its place is in the air still.
-        """
-        points = torch.from_numpy(part.points)
-        return float((part.motion.apply(points) - points).norm(dim=-1).max()) > self.pieces.voxel
-
     def _out_of_sight(self, part: MovingPart, trial: Trial, parts: list[MovingPart]) -> MovingPart | None:
         """A part that nothing explains, where the other state's photos do not show it; None if they would.
 
@@ -204,7 +196,7 @@ class PartSearch:
                 continue
             share = len(part.points) / len(self.pieces.looks[part.state].points)
             large = share > self.config.large
-            if part.gain < (-self.config.harm if large else NOISE) or not self._goes_anywhere(part):
+            if part.gain < (-self.config.harm if large else NOISE):
                 unseen = self._out_of_sight(part, trial, parts) if large else None
                 if large and unseen is None:
                     refused[index] = (part.state, share)

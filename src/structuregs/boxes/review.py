@@ -34,7 +34,15 @@ class PartReview:
         """The parts as all of them together say."""
         parts = self.exchanged(self.without_doubles(found))
         parts = self._reconsider(self.joined([self.at_its_clearest(part) for part in parts]))
-        return [self._laid_alike(part) for part in self._settled(self._without_pieces(parts))]
+        return self.going_somewhere([self._laid_alike(part) for part in self._settled(self._without_pieces(parts))])
+
+    def going_somewhere(self, parts: list[MovingPart]) -> list[MovingPart]:
+        """The parts, without those whose motion carries nothing as far as what moved was found from all the other state has.
+
+        There nothing of them lands: they were in the air where they were found.
+        """
+        least, rows = self.config.cue.threshold * self.pieces.voxel, [(part, torch.from_numpy(part.points)) for part in parts]
+        return [part for part, points in rows if float((part.motion.apply(points) - points).norm(dim=-1).max()) > least]
 
     def without_doubles(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those that lie where others do and beside them explain nothing: found wrong before."""
