@@ -42,7 +42,7 @@ class SearchConfig:
     no surface, but splats in the air before one that few views see; surfaces come out at .15 to 1, these below .1."""
     painted: float = 0.05
     """A cluster that paints less of its own state's photos than this times its share of the state's points is no surface, but
-    points in the air where there are hardly any splats; surfaces come out at .4 and more, these below .015."""
+    points in the air where there are hardly any splats; surfaces come out at .3 and more, these below .01."""
     clear: float = 3.0
     """Splats this near to a cluster's box, in voxels, belong to it."""
     shortlist: int = 110
