@@ -41,8 +41,8 @@ class PartReview:
 
         There nothing of them lands: they were in the air where they were found.
         """
-        least, rows = self.config.cue.threshold * self.pieces.voxel, [(part, torch.from_numpy(part.points)) for part in parts]
-        return [part for part, points in rows if float((part.motion.apply(points) - points).norm(dim=-1).max()) > least]
+        least = self.config.cue.threshold * self.pieces.voxel
+        return [part for part in parts if np.linalg.norm(part.points_in(1) - part.points_in(0), axis=-1).max() > least]
 
     def without_doubles(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those that lie where others do and beside them explain nothing: found wrong before."""

@@ -99,10 +99,8 @@ def finished_object(state: FitState) -> ArticulatedObject:
     """
     parts = state.variables.parts().detach()
     left = [k for k, count in enumerate(parts.counts) if k == 0 or count]
-    for k in reversed(range(len(parts))):
-        if k not in left:
-            parts = parts.joined(0, k)
-    parts = tightened(parts)
+    counts = tuple(parts.counts[k] for k in left)
+    parts = tightened(replace(parts, boxes=parts.boxes[left], motions=parts.motions[left], counts=counts))
     if state.variables.kinds is None:
         return articulate(parts)
     kinds: list[JointKind] = [state.variables.kinds[k - 1] for k in left[1:]]
