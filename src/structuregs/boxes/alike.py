@@ -19,8 +19,10 @@ from torch import Tensor
 
 from ..capture import ImageStack, spread_cameras
 from ..geometry import SE3, Box
+from ..jit import lanes
 from ..model import Splats
 from ..raster import coverage_of, render_surface
+from .alike_kernels import left_unexplained
 from .appearance import LOOK_DILATION
 
 _VIEWS = 48  # photos of the one state, each laid upon...
@@ -57,10 +59,6 @@ class Shown:
         self.stack = stack
         self.splats = splats
         self.part = part
-        poses = [camera.T_world_camera.inverse().to(dtype=torch.float64) for camera in stack.cameras]
-        self._rotations = np.stack([pose.rotation.numpy() for pose in poses])
-        self._offsets = np.stack([pose.xyz.numpy() for pose in poses])
-        self._lenses = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in stack.cameras])
         self._depths: dict[int, Float32[np.ndarray, "H W"]] = {}
         self._clear: dict[int, Bool[np.ndarray, "H W"]] = {}
 
@@ -68,6 +66,14 @@ class Shown:
     def centres(self) -> Float64[Tensor, "V 3"]:
         """Of the cameras, in the world."""
         return torch.stack([camera.centre.double() for camera in self.stack.cameras])
+
+    @cached_property
+    def projections(self) -> tuple[Float64[np.ndarray, "V 3 3"], Float64[np.ndarray, "V 3"], Float64[np.ndarray, "V 4"]]:
+        """Rotations and translations from the world to the cameras, and their fx, fy, cx and cy."""
+        cameras = self.stack.cameras
+        poses = [camera.T_world_camera.inverse().to(dtype=torch.float64) for camera in cameras]
+        lenses = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras])
+        return np.stack([pose.rotation.numpy() for pose in poses]), np.stack([pose.xyz.numpy() for pose in poses]), lenses
 
     @cached_property
     def blurred(self) -> dict[float, Float32[np.ndarray, "V H W"]]:
@@ -104,23 +110,14 @@ class Shown:
         normals *= -np.sign((normals * rays).sum(-1, keepdims=True))
         return points, normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
 
-    def project(
-        self, points: Float64[np.ndarray, "P 3"], photos: Int64[np.ndarray, " P"]
-    ) -> tuple[Float64[np.ndarray, "P 2"], Float64[np.ndarray, " P"]]:
-        """Row and column (pixel centres are whole numbers), and depth along z, of each point in a photo of its own."""
-        there = np.einsum("pij,pj->pi", self._rotations[photos], points) + self._offsets[photos]
-        depth = np.maximum(there[:, 2], 1e-9)
-        fx, fy, cx, cy = self._lenses[photos].T
-        return np.stack([fy * there[:, 1] / depth + cy, fx * there[:, 0] / depth + cx], 1) - 0.5, there[:, 2]
-
     def sees(self, points: Float64[np.ndarray, "P 3"], v: int, within: float) -> Bool[np.ndarray, " P"]:
         """Which points lie on the surface that a photo shows of the part, as far as `within` before or behind it."""
         surface, clear = self.depth(v), self.clear(v)
-        at, depth = self.project(points, np.full(len(points), v))
-        row, column = np.rint(at).astype(int).T
+        pixels, z = self.stack.cameras[v].project(torch.from_numpy(points))
+        column, row = np.floor(pixels.numpy()).astype(np.int64).T
         inside = (row >= 0) & (row < surface.shape[0]) & (column >= 0) & (column < surface.shape[1])
         row, column = row * inside, column * inside
-        return inside & clear[row, column] & (np.abs(surface[row, column] - depth) < within)
+        return inside & clear[row, column] & (np.abs(surface[row, column] - z.numpy()) < within)
 
 
 @dataclass(frozen=True)
@@ -179,7 +176,7 @@ class Overlap:
         names = ("pixels", "points", "local", "normals", "photos")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
-    def unlike(self, further: SE3 | None = None, blur: float = _BLURS[-1]) -> float:
+    def unlike(self, further: Float64[np.ndarray, "4 4"] | None = None, blur: float = _BLURS[-1]) -> float:
         """What photos of the other state leave unexplained of those of the one, as a share of how much these vary.
 
         Each pair of photos has a brightness and a contrast of its own.  Photos that have nothing in common leave a little more
@@ -191,17 +188,34 @@ class Overlap:
         """
         if not len(self):
             return 1.0
-        moved = self.points if further is None else further.apply(torch.from_numpy(self.points)).numpy()
-        at = np.concatenate([self.photos[:, None], self.there.project(moved, self.photos)[0]], 1)
-        seen = ndimage.map_coordinates(self.there.blurred[blur], at.T, order=1, mode="nearest").astype(np.float64)
-        asked = self.here.blurred[blur][tuple(self.pixels.T)].astype(np.float64)
+        asked, varied = self._asked[blur]
+        if varied <= _PLAIN:
+            return 1.0
+        way = np.eye(4) if further is None else further
+        there = self.there
+        with lanes():
+            left = left_unexplained(
+                self.points, self.photos, self._starts, asked, way[:3], *there.projections, there.blurred[blur], _CUT_OFF
+            )
+        return float(left.sum() / len(self) / varied)
+
+    @cached_property
+    def _starts(self) -> Int64[np.ndarray, " G"]:
+        """Where pixels of two other photos begin, and the end."""
         changes = (np.diff(self.pixels[:, 0]) != 0) | (np.diff(self.photos) != 0)
-        starts = np.concatenate([[0], np.flatnonzero(changes) + 1])
-        seen, asked = seen - _means(seen, starts), asked - _means(asked, starts)
-        contrast = np.clip(_means(seen * asked, starts) / np.maximum(_means(seen * seen, starts), 1e-12), 0.5, 2.0)
-        left = (asked - contrast * seen) / np.maximum(contrast, 1.0)
-        unexplained, varied = (np.minimum(np.abs(values), _CUT_OFF).mean() for values in (left, asked))
-        return float(unexplained / varied) if varied > _PLAIN else 1.0
+        return np.concatenate([[0], np.flatnonzero(changes) + 1, [len(self)]])
+
+    @cached_property
+    def _asked(self) -> dict[float, tuple[Float64[np.ndarray, " P"], float]]:
+        """By blur: brightness of the pixels, less its mean over those of the same two photos, and how much that varies."""
+        return {
+            blur: self._varying(image[tuple(self.pixels.T)].astype(np.float64)) for blur, image in self.here.blurred.items()
+        }
+
+    def _varying(self, values: Float64[np.ndarray, " P"]) -> tuple[Float64[np.ndarray, " P"], float]:
+        count = np.diff(self._starts)
+        values = values - np.repeat(np.add.reduceat(values, self._starts[:-1]) / count, count)
+        return values, float(np.minimum(np.abs(values), _CUT_OFF).mean())
 
 
 @dataclass(frozen=True)
@@ -233,11 +247,25 @@ class Face:
         turned = pose.rotation[:, [(best + 1) % 3, (best + 2) % 3, best]]
         return Face(overlap.of(chosen), SE3.from_rotation(turned, pose.xyz))
 
-    def moved(self, place: Float64[np.ndarray, " 3"]) -> SE3:
+    def moved(self, place: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "4 4"]:
         """The motion of the world that brings the face from where it was found to a place."""
-        x, y, turn = (place * self.overlap.unit).tolist()
-        tangent = torch.tensor([x, y, 0, 0, 0, turn / float(self.overlap.box.half_extents.norm())], dtype=torch.float64)
-        return self.pose @ SE3.exp(tangent) @ self.pose.inverse()
+        x, y, turn = place * self.overlap.unit
+        angle = turn / self._rim
+        planar = np.eye(4)
+        planar[:2] = [[np.cos(angle), -np.sin(angle), 0, x], [np.sin(angle), np.cos(angle), 0, y]]
+        return self._T_world_face @ planar @ self._T_face_world
+
+    @cached_property
+    def _rim(self) -> float:
+        return float(self.overlap.box.half_extents.norm())
+
+    @cached_property
+    def _T_world_face(self) -> Float64[np.ndarray, "4 4"]:
+        return self.pose.as_matrix().numpy()
+
+    @cached_property
+    def _T_face_world(self) -> Float64[np.ndarray, "4 4"]:
+        return self.pose.inverse().as_matrix().numpy()
 
     def unlike(self, place: Float64[np.ndarray, " 3"], blur: float = _BLURS[-1]) -> float:
         """What photos leave unexplained of each other with the face at a place (see `Overlap.unlike`)."""
@@ -280,7 +308,7 @@ class Face:
 
     def laid(self, place: Float64[np.ndarray, " 3"]) -> SE3:
         """The motion of the part with the face at a place."""
-        return self.moved(place) @ self.overlap.motion
+        return SE3.from_matrix(torch.from_numpy(self.moved(place))) @ self.overlap.motion
 
     def alike_at(self) -> Float64[np.ndarray, " 3"] | None:
         """The place where the photos of the face are alike.
@@ -321,9 +349,3 @@ def _directions(here: Shown, there: Shown, motion: SE3, box: Box) -> tuple[np.nd
         for centres in (here.centres, motion.inverse().apply(there.centres))
     )
     return one.numpy(), other.numpy()
-
-
-def _means(values: Float64[np.ndarray, " P"], starts: Int64[np.ndarray, " G"]) -> Float64[np.ndarray, " P"]:
-    """The mean of the group that each value is of; groups lie together, each from its start on."""
-    count = np.diff(np.append(starts, len(values)))
-    return np.repeat(np.add.reduceat(values, starts) / count, count)
