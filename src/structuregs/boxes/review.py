@@ -14,7 +14,7 @@ from ..joints import kind_of
 from .alike import Face, Overlap, Shown
 from .cue import linked, one_box_holds
 from .divide import AROUND, moving_along
-from .hypotheses import displacements, distinct, flips, stack_motions
+from .hypotheses import Hypothesis, displacements, distinct, flips, stack_motions
 from .judge import Trial
 from .pieces import MovingPart, Pieces
 from .refine import just_out_of_sight, measured
@@ -170,37 +170,57 @@ class PartReview:
         while index < len(parts) > 1:
             part, others = parts[index], parts[:index] + parts[index + 1 :]
             trial = self._again(part, others)
-            shared = [other.motion_from(part.state) for other in others]
-            own = part.hypothesis
-            as_they_move = [trial.judge(trial.moved(own, T)) for T in shared]
-            starts = [*(trial.judge(h) for h in (own, *part.rivals[:2])), *as_they_move]
-            again = [self.pieces.pulled(h, trial, self.config.steps) for h in starts]
-            by_cost = sorted(again, key=trial.cost)
-            gaps = displacements(stack_motions(shared), by_cost[0].motion, trial.box)
-            losses = np.array([h.error for h in as_they_move]) - min(h.error for h in again)
-            touching = np.array([self._continues(part, other) for other in others])
-            alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
-            lesser = np.array([other.weight >= part.weight for other in others])
-            shows = trial.shows(starts[0])
-            alike &= (shows & lesser) | touching | self._agree(part, others, gaps, shows)
-            # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
-            best_of_its_own = min(map(trial.burden, again[: -len(shared)]))
-            needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
-            alike |= needless & touching & lesser
-            little = _NO_SCRAP * part.weight
-            if not shows and trial.explained(by_cost[0]) < little:  # nor has one that explains little, and loses little
-                alike |= (losses < little) & touching & lesser
-
-            twin = int(np.argmin(np.where(alike, losses, np.inf)))
-            if alike[twin]:
-                follower, leader = sorted((part, others[twin]), key=lambda p: p.weight)
-                parts = self._merged(leader, follower, [p for p in others if p is not others[twin]])
+            ways = [other.motion_from(part.state) for other in others]
+            starts = [part.hypothesis, *part.rivals[:2], *(trial.moved(part.hypothesis, T) for T in ways)]
+            judged = [trial.judge(h) for h in starts]
+            pulled = [self.pieces.pulled(h, trial, self.config.steps) for h in judged]
+            twin = self._twin(part, others, trial, judged, pulled)
+            if twin is not None:
+                follower, leader = sorted((part, twin), key=lambda p: p.weight)
+                parts = self._merged(leader, follower, [p for p in others if p is not twin])
                 index = 0
                 continue
+            by_cost = sorted(pulled, key=trial.cost)
             chosen = distinct(stack_motions([h.motion for h in by_cost]), trial.box, 0.1, len(by_cost))
             parts[index] = replace(part, hypothesis=by_cost[0], rivals=tuple(by_cost[c] for c in chosen[1:]))
             index += 1
         return parts
+
+    def _twin(
+        self,
+        part: MovingPart,
+        others: list[MovingPart],
+        trial: Trial,
+        judged: list[Hypothesis],
+        pulled: list[Hypothesis],
+    ) -> MovingPart | None:
+        """Which other part a part moves like, or may as well; of several the one that photos mind least; None if none.
+
+        Args:
+            part: that was found.
+            others: that it may move like.
+            trial: the part between the photos, with the others in place.
+            judged: its own motion, its rivals, and then the motion of each of the others.
+            pulled: the same after the photos have pulled them into place.
+        """
+        own = len(judged) - len(others)
+        as_they_move, best = judged[own:], min(pulled, key=trial.cost)
+        gaps = displacements(stack_motions([h.motion for h in as_they_move]), best.motion, trial.box)
+        losses = np.array([h.error for h in as_they_move]) - min(h.error for h in pulled)
+        touching = np.array([self._continues(part, other) for other in others])
+        lesser = np.array([other.weight >= part.weight for other in others])
+        shows = trial.shows(judged[0])
+        alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
+        alike &= (shows & lesser) | touching | self._agree(part, others, gaps, shows)
+        # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
+        best_of_its_own = min(map(trial.burden, pulled[:own]))
+        needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
+        alike |= needless & touching & lesser
+        little = _NO_SCRAP * part.weight
+        if not shows and trial.explained(best) < little:  # nor has one that explains little, and loses little
+            alike |= (losses < little) & touching & lesser
+        twin = int(np.argmin(np.where(alike, losses, np.inf)))
+        return others[twin] if alike[twin] else None
 
     def _agree(
         self, part: MovingPart, others: list[MovingPart], gaps: Float64[np.ndarray, " N"], shows: bool

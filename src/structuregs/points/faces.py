@@ -38,16 +38,17 @@ def face_axes(points: Float64[np.ndarray, "P 3"], start: Axes, cell: float) -> A
     for axes in (turned[k] for k in ranked):
         if len(starts) < _STARTS and all(_apart(axes, other) > _CLOSE for other in starts):
             starts.append(axes)
-    best = max((_climbed(points, axes, cell) for axes in starts), key=lambda axes: _sharpness(points, axes, cell))
-    if not _clearly_sharper(points, best, start, cell):
-        best = start
+    sharpness, best = max((_climbed(points, axes, cell) for axes in starts), key=lambda found: found[0])
+    as_given = _sharpness(points, start, cell)
+    if sharpness <= _SHARPER * as_given:
+        sharpness, best = as_given, start
     world = np.round(best)  # signed axes of the world, if the best are near any; at 45 degrees it is no rotation
     near = np.abs(world).sum() == 3 and _apart(best, world) < _FRAME
-    return world if near and not _clearly_sharper(points, best, world, cell) else best
+    return world if near and sharpness <= _SHARPER * _sharpness(points, world, cell) else best
 
 
-def _climbed(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> Axes:
-    """Axes from which no small turn leads to sharper layers."""
+def _climbed(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> tuple[float, Axes]:
+    """Axes from which no small turn leads to sharper layers, after how sharp they are."""
     best = _sharpness(points, axes, cell)
     for step in _STEPS:
         turns = _turns(np.array([-step, 0.0, step]))
@@ -57,7 +58,7 @@ def _climbed(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> Axe
             if max(scores) <= best:
                 break
             best, axes = max(scores), turned[int(np.argmax(scores))]
-    return axes
+    return best, axes
 
 
 def _turns(degrees: Float64[np.ndarray, " T"]) -> list[Axes]:
@@ -68,11 +69,6 @@ def _turns(degrees: Float64[np.ndarray, " T"]) -> list[Axes]:
 def _apart(one: Axes, other: Axes) -> float:
     """Degrees between two rotations."""
     return float(np.degrees(Rotation.from_matrix(one.T @ other).magnitude()))
-
-
-def _clearly_sharper(points: Float64[np.ndarray, "P 3"], one: Axes, other: Axes, cell: float) -> bool:
-    """Whether layers are sharper across the one axes than across the other by more than chance."""
-    return _sharpness(points, one, cell) > _SHARPER * _sharpness(points, other, cell)
 
 
 def _sharpness(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> float:
