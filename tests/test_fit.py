@@ -1,6 +1,10 @@
+import hashlib
 import json
 import math
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +16,11 @@ from torch import Tensor
 
 from door_and_drawer import DOOR, DRAWER, made_of, photographed
 from structuregs.capture import stack_views
+from structuregs.export import part_meshes
 from structuregs.fit.boxes import base_tightened, drawn_out, squared_up, tightened
 from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
+from structuregs.fit.laying import BothStates
 from structuregs.fit.loop import Fitter
 from structuregs.fit.merge import idle_part, moving_alike
 from structuregs.fit.reconstruct import choose_device, finished_object
@@ -24,7 +30,7 @@ from structuregs.fit.state import FitState
 from structuregs.fit.straight import askew, held_along_base, lie_along_base, straight_where_loose
 from structuregs.fit.variables import SPLAT_NAMES, Variables, part_index
 from structuregs.geometry import SE3, Box, JointKind, Screw, quat_to_matrix
-from structuregs.joints import constrain
+from structuregs.joints import articulate, constrain
 from structuregs.model import ArticulatedObject, PosedParts, Splats
 from structuregs.raster import render
 
@@ -510,6 +516,36 @@ class TestOptimiser:
         list(fit.run(21))
         assert fit.state.variables.kinds == ("revolute", "prismatic")
         torch.testing.assert_close(fit.state.free_motions, free)
+
+
+def digest() -> str:
+    """Of a fit with all losses, of how alike its photos are laid upon each other, and of its meshes."""
+    surfaces = {"planarity_from": 0.0, "planarity_weight": 0.1, "planarity_size": 48}
+    splats, g = DOOR_AND_DRAWER.splats, torch.Generator().manual_seed(0)
+    uneven = replace(splats, log_scales=splats.log_scales + 0.5 * torch.randn(len(splats), 3, generator=g))
+    config = replace(QUICK, steps=10, image_from=2, structure_until=10, loose_until=5, lay_at=(), **surfaces)
+    fit = fitter(config, replace(DOOR_AND_DRAWER, splats=uneven))
+    list(fit.run(10))
+    with torch.no_grad():
+        parts = fit.state.variables.parts()
+        alike = [BothStates(parts, fit.capture).laid(k, state).unlike() for k in (1, 2) for state in (0, 1)]
+        meshes = part_meshes(articulate(parts), fit.capture, voxel=0.05)
+    arrays = [leaf.detach().numpy() for leaf in fit.state.variables.leaves.values()]
+    assert all(share < 1 for share in alike)
+    assert all(len(mesh.faces) for mesh in meshes)
+    every = (np.ascontiguousarray(array) for array in (*arrays, *(mesh.vertices for mesh in meshes), np.array(alike)))
+    return hashlib.sha256(b"".join(array.tobytes() for array in every)).hexdigest()
+
+
+def test_kernels_compiled_just_now_and_from_the_cache_give_the_same_bytes(tmp_path: Path):
+    """A first run compiles them, and the same run after it, or one that goes on where it was killed, loads them."""
+    code = "import test_fit; print(test_fit.digest())"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent)}
+    compiled, loaded = (
+        subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert compiled == loaded
 
 
 class TestCheckpoint:

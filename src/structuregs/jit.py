@@ -12,8 +12,10 @@ import numpy as np
 from numba import get_num_threads, njit, set_num_threads
 from numba.core import event
 
-# All freedom but the one to assume that there is no NaN or infinity: the guards against those must stay.
-_FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
+# Not the freedom to assume that there is no NaN or infinity: the guards against those must stay.  Nor that to add up in
+# another order or to divide by multiplying: a process that has just compiled a kernel runs another copy of its loops than
+# one that loads it from the cache, and the two would make use of it differently.
+_FASTMATH = {"nsz", "contract", "afn"}
 
 # Numba's fallback threading layer ends the process when two Python threads launch parallel kernels at once.
 _LAUNCH = threading.Lock()

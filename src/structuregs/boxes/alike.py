@@ -191,12 +191,12 @@ class Overlap:
         asked, varied = self._asked[blur]
         if varied <= _PLAIN:
             return 1.0
-        way = np.eye(4) if further is None else further
-        there = self.there
+        turns, shifts, lenses = self.there.projections
+        if further is not None:
+            turns, shifts = turns @ further[:3, :3], turns @ further[:3, 3] + shifts
+        images = self.there.blurred[blur]
         with lanes():
-            left = left_unexplained(
-                self.points, self.photos, self._starts, asked, way[:3], *there.projections, there.blurred[blur], _CUT_OFF
-            )
+            left = left_unexplained(self.points, self.photos, self._starts, asked, turns, shifts, lenses, images, _CUT_OFF)
         return float(left.sum() / len(self) / varied)
 
     @cached_property

@@ -7,15 +7,15 @@ from ..jit import kernel
 
 
 @kernel(parallel=True)
-def left_unexplained(points, photos, starts, asked, motion, rotations, offsets, lenses, images, most):
+def left_unexplained(points, photos, starts, asked, turns, shifts, lenses, images, most):
     """What photos of one state leave unexplained of those of another, summed over each group of pixels (G).
 
     A group has a brightness and a contrast of its own; what is unexplained of a pixel counts as at most `most`.
 
     points (P 3): what pixels of the other state's photos show, in the world; photos (P): which one of the images shows
     it, the same throughout a group; starts (G + 1): where groups begin, and P; asked (P): brightness, less its mean over the
-    group; motion (3 4): of the points; rotations (V 3 3), offsets (V 3), lenses (V 4: fx fy cx cy): from the world to pixels;
-    images (V H W): brightness.
+    group; turns (V 3 3), shifts (V 3), lenses (V 4: fx fy cx cy): from the world to the images' pixels; images (V H W):
+    brightness.
     """
     H, W = images.shape[1:]
     G = len(starts) - 1
@@ -24,8 +24,7 @@ def left_unexplained(points, photos, starts, asked, motion, rotations, offsets, 
     for g in prange(G):
         first, last = starts[g], starts[g + 1]
         v = photos[first]
-        image, lens, turn = images[v], lenses[v], rotations[v] @ np.ascontiguousarray(motion[:, :3])
-        shift = rotations[v] @ np.ascontiguousarray(motion[:, 3]) + offsets[v]
+        image, lens, turn, shift = images[v], lenses[v], turns[v], shifts[v]
         total = squares = products = 0.0
         for i in range(first, last):
             a, b, c = points[i, 0], points[i, 1], points[i, 2]

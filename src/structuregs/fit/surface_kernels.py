@@ -86,11 +86,12 @@ def slopes_and_gradient(planes, solid, changes, lens, steps, edge, lowest, lanes
                         table[y, :, step:], table[y, :, :n], changes[1, y, step:], changes[1, y, :n], rays[y, :, step:],
                         rays[y, :, :n], steepness, decay, lowest, sums[:, step:],
                     )  # fmt: skip
-            total = 0.0
             for x in range(width):
                 u, v = rays[y, 0, x], rays[y, 1, x]
                 gradient[y, x, 0] = sums[0, x] + u * sums[3, x]
                 gradient[y, x, 1] = sums[1, x] + v * sums[3, x]
                 gradient[y, x, 2] = sums[2, x] + sums[3, x]
+            total = 0.0
+            for x in range(width):
                 total += sums[4, x]
             parts[y] = total

@@ -26,18 +26,24 @@ _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 
 
 @kernel()
-def _absolute(image, target, y0, y1, x0, x1, weight, gradient):
-    """Sum of |image - target| in a rectangle; sets the gradient to weight times the sign."""
+def _sum(values, n):
     total = 0.0
+    for x in range(n):
+        total += values[x]
+    return total
+
+
+@kernel()
+def _absolute(image, target, y0, y1, x0, x1, weight, gradient, columns):
+    """Sum of |image - target| in a rectangle; sets the gradient to weight times the sign.  Columns is scratch memory."""
+    columns[: x1 - x0] = _ZERO
     for y in range(y0, y1):
         a, b, g = image[y, x0:x1], target[y, x0:x1], gradient[y, x0:x1]
-        row = _ZERO
         for x in range(x1 - x0):
             d = a[x] - b[x]
-            row += abs(d)
+            columns[x] += abs(d)
             g[x] = (weight if d > _ZERO else _ZERO) - (weight if d < _ZERO else _ZERO)
-        total += row
-    return total
+    return _sum(columns, x1 - x0)
 
 
 @kernel()
@@ -131,15 +137,15 @@ def _add_gradient(maps, a, b, weight, n, out):
 
 
 @kernel()
-def _ssim(image, target, y0, y1, x0, x1, weight, gradient, a, b, blurred, sums, maps):
-    """Sum of 1 - SSIM in a rectangle; adds weight times its gradient.  The last five arguments are scratch memory."""
+def _ssim(image, target, y0, y1, x0, x1, weight, gradient, a, b, blurred, sums, maps, columns):
+    """Sum of 1 - SSIM in a rectangle; adds weight times its gradient.  The last six arguments are scratch memory."""
     height, width = image.shape
     rows, n = y1 - y0, x1 - x0
     if _agree(image, target, y0 - 2 * HALF, y1 + 2 * HALF, x0 - 2 * _REACH, x1 + 2 * _REACH):
         return 0.0
     _load(image, y0 - 2 * HALF, x0 - 2 * _REACH, rows + 4 * HALF, n + 4 * _REACH, a)
     _load(target, y0 - 2 * HALF, x0 - 2 * _REACH, rows + 4 * HALF, n + 4 * _REACH, b)
-    total = 0.0
+    columns[:n] = _ZERO
     first, last = max(0, _REACH - x0), min(n + 2 * _REACH, width - x0 + _REACH)
     for y in range(rows + 2 * HALF):
         if not 0 <= y + y0 - HALF < height:
@@ -150,10 +156,8 @@ def _ssim(image, target, y0, y1, x0, x1, weight, gradient, a, b, blurred, sums, 
             _along(sums[q], n + 2 * _REACH, maps[q])
         _derivatives(maps, n + 2 * _REACH)
         if HALF <= y < rows + HALF:
-            part = _ZERO
             for x in range(n):
-                part += _ONE - maps[3, x + _REACH]
-            total += part
+                columns[x] += _ONE - maps[3, x + _REACH]
         for q in range(3):
             maps[q, :first] = _ZERO
             maps[q, last : n + 2 * _REACH] = _ZERO
@@ -163,7 +167,7 @@ def _ssim(image, target, y0, y1, x0, x1, weight, gradient, a, b, blurred, sums, 
             _down(blurred[q], y, n, maps[q])
         a_row, b_row = a[y + 2 * HALF, 2 * _REACH :], b[y + 2 * HALF, 2 * _REACH :]
         _add_gradient(maps, a_row, b_row, -weight, n, gradient[y + y0, x0:x1])
-    return total
+    return _sum(columns, n)
 
 
 @kernel(parallel=True)
@@ -189,13 +193,14 @@ def loss_and_gradient(image, target, alpha, target_alpha, weights, lanes, g_imag
         b = np.empty_like(a)
         blurred = np.empty((3, ROWS + 2 * HALF, n), np.float32)
         sums, maps = np.empty((4, n + 4 * _REACH), np.float32), np.empty((4, n + 2 * _REACH), np.float32)
+        columns = np.empty(n, np.float32)
         for job in range(lane, len(parts), lanes):
             y0, x0 = job // across * ROWS, job % across * COLUMNS
             y1, x1 = min(y0 + ROWS, height), min(x0 + COLUMNS, width)
-            parts[job, 0] = _absolute(image, target, y0, y1, x0 * _STEP, x1 * _STEP, weights[0], g_image)
-            parts[job, 2] = _absolute(alpha, target_alpha, y0, y1, x0, x1, weights[2], g_alpha)
+            parts[job, 0] = _absolute(image, target, y0, y1, x0 * _STEP, x1 * _STEP, weights[0], g_image, columns)
+            parts[job, 2] = _absolute(alpha, target_alpha, y0, y1, x0, x1, weights[2], g_alpha, columns)
             parts[job, 1] = 0.0
             if weights[1] != 0:
                 parts[job, 1] = _ssim(
-                    image, target, y0, y1, x0 * _STEP, x1 * _STEP, weights[1], g_image, a, b, blurred, sums, maps
+                    image, target, y0, y1, x0 * _STEP, x1 * _STEP, weights[1], g_image, a, b, blurred, sums, maps, columns
                 )  # fmt: skip

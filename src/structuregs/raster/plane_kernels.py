@@ -6,7 +6,7 @@ import numpy as np
 from numba import prange
 
 from ..jit import kernel
-from .project_kernels import camera_point, dot, quat_gradient, rotation, times, unit_quat, world_column
+from .project_kernels import camera_point, dot, quat_gradient, rotation, unit_quat, world_column
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -38,9 +38,17 @@ def _leaning(normal, centre, steepest):
 
 
 @kernel()
+def _picked(row, j):
+    """One of three values.  An index that is not known before makes branches, which copies of a kernel round differently."""
+    return row[0] if j == 0 else (row[1] if j == 1 else row[2])
+
+
+@kernel()
 def _axis(W, quats, log_scales, i):
     w, x, y, z, _ = unit_quat(quats, i)
-    return times(W, rotation(w, x, y, z), _shortest(log_scales, i))
+    R, j = rotation(w, x, y, z), _shortest(log_scales, i)
+    axis = _picked(R[0], j), _picked(R[1], j), _picked(R[2], j)
+    return dot(W[0], axis), dot(W[1], axis), dot(W[2], axis)
 
 
 @kernel(parallel=True)
