@@ -289,7 +289,10 @@ def parts_of(name: str) -> list[MovingPart]:
 
 @lru_cache
 def true_parts_of(name: str) -> tuple[PartReview, list[MovingPart]]:
-    """An object's parts as state 1 shows them, cut out by their true boxes, with their true motions; and who reviews them."""
+    """An object's parts as state 1 shows them, cut out by their true boxes, with their true motions; and who reviews them.
+
+    The weightiest comes first, as in a search.
+    """
     obj, looks = looks_of(name)
     pieces = Pieces(looks, SMALL.search, seed=0)
     margin = 1.5 * pieces.voxel
@@ -304,7 +307,7 @@ def true_parts_of(name: str) -> tuple[PartReview, list[MovingPart]]:
         trial = pieces.trial(1, points, looks[1].splats[held], weight, [])
         found = trial.judge(Hypothesis(joint.motion().inverse(), 0.0, 0.0, 0.0))
         parts.append(MovingPart(1, (points,), found, trial.gain(found), weight))
-    return PartReview(pieces), parts
+    return PartReview(pieces), sorted(parts, key=lambda part: -part.weight)
 
 
 @lru_cache
@@ -836,7 +839,7 @@ class TestReview:
     def test_parts_side_by_side_that_move_differently_stay_two(self):
         review, parts = true_parts_of("cabinet")
         assert len(parts) == 2
-        assert review.joined(parts) == sorted(parts, key=lambda part: -part.weight)
+        assert review.joined(parts) == parts
         assert review.joined(parts[:1]) == parts[:1]
 
     def test_what_lies_nearer_to_another_part_is_not_brought_back(self):

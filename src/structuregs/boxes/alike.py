@@ -68,12 +68,9 @@ class Shown:
         return torch.stack([camera.centre.double() for camera in self.stack.cameras])
 
     @cached_property
-    def projections(self) -> tuple[Float64[np.ndarray, "V 3 3"], Float64[np.ndarray, "V 3"], Float64[np.ndarray, "V 4"]]:
-        """Rotations and translations from the world to the cameras, and their fx, fy, cx and cy."""
-        cameras = self.stack.cameras
-        poses = [camera.T_world_camera.inverse().to(dtype=torch.float64) for camera in cameras]
-        lenses = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras])
-        return np.stack([pose.rotation.numpy() for pose in poses]), np.stack([pose.xyz.numpy() for pose in poses]), lenses
+    def projections(self) -> Float64[np.ndarray, "V 3 4"]:
+        """From the world to the photos' pixels."""
+        return np.stack([camera.projection.numpy() for camera in self.stack.cameras])
 
     @cached_property
     def blurred(self) -> dict[float, Float32[np.ndarray, "V H W"]]:
@@ -191,12 +188,10 @@ class Overlap:
         asked, varied = self._asked[blur]
         if varied <= _PLAIN:
             return 1.0
-        turns, shifts, lenses = self.there.projections
-        if further is not None:
-            turns, shifts = turns @ further[:3, :3], turns @ further[:3, 3] + shifts
+        projections = self.there.projections if further is None else self.there.projections @ further
         images = self.there.blurred[blur]
         with lanes():
-            left = left_unexplained(self.points, self.photos, self._starts, asked, turns, shifts, lenses, images, _CUT_OFF)
+            left = left_unexplained(self.points, self.photos, self._starts, asked, projections, images, _CUT_OFF)
         return float(left.sum() / len(self) / varied)
 
     @cached_property

@@ -106,8 +106,7 @@ def _look(pieces: list[Splats], boxes: Box, camera: Camera, mask: UInt8[np.ndarr
 
 
 def _projection(camera: Camera, T_world_box: SE3) -> Float64[np.ndarray, "3 4"]:
-    T_camera_box = camera.T_world_camera.to(dtype=torch.float64).inverse() @ T_world_box.to(dtype=torch.float64)
-    return (camera.K.double() @ T_camera_box.as_matrix()[:3]).numpy()
+    return (camera.projection @ T_world_box.to(dtype=torch.float64).as_matrix()).numpy()
 
 
 def _volume(half_extents: Float64[np.ndarray, " 3"], voxel: float) -> Volume:

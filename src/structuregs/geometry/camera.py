@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from .se3 import SE3
@@ -46,6 +46,11 @@ class Camera:
     def K(self) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix, pixels."""
         return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    @property
+    def projection(self) -> Float64[Tensor, "3 4"]:
+        """World points (homogeneous) to pixels times depth, and depth."""
+        return self.K.double() @ self.T_world_camera.to(dtype=torch.float64).inverse().as_matrix()[:3]
 
     @property
     def centre(self) -> Float[Tensor, " 3"]:

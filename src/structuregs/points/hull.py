@@ -93,7 +93,7 @@ class Silhouettes:
     @property
     def projections(self) -> Float64[np.ndarray, "V 3 4"]:
         """Projection matrices, world to pixels."""
-        rows = [c.K.double() @ c.T_world_camera.to(dtype=torch.float64).inverse().as_matrix()[:3] for c in self.cameras]
+        rows = [camera.projection for camera in self.cameras]
         return torch.stack(rows).numpy()
 
     def carve(self, low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"], resolution: int) -> Hull:
