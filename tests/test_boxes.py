@@ -39,7 +39,7 @@ from structuregs.boxes.hypotheses import (
     turn_about,
 )
 from structuregs.boxes.judge import Scene, Trial
-from structuregs.boxes.partition import Division, Found, undivided
+from structuregs.boxes.partition import Division, Found, undivided, worth_more
 from structuregs.boxes.pieces import Pieces
 from structuregs.boxes.refine import along_base, just_out_of_sight, refine, shortest_out_of_sight, simplest
 from structuregs.boxes.review import PartReview
@@ -259,6 +259,11 @@ def test_a_turn_about_a_centre_leaves_it_where_it_is():
     rotation_only = torch.cat([torch.zeros(3, dtype=F64), tangent[3:]])
     torch.testing.assert_close(turn_about(centre, rotation_only).apply(centre), centre)
     torch.testing.assert_close(turn_about(centre, tangent).apply(centre), centre + SE3.exp(tangent).xyz)
+
+
+def _beside(box: Box, points: Tensor) -> Tensor:
+    """How far points are from a box, 0 inside."""
+    return (box.to_canonical(points).abs() - box.half_extents).clamp(min=0).norm(dim=-1)
 
 
 @lru_cache
@@ -546,6 +551,17 @@ class TestParts:
         weight = scene.absent - scene.error(few, NO_MOTION)
         assert weight > SMALL.search.there * scene.footprint(few) > 0
         assert all(cluster.state != largest.state for cluster in after.clusters)
+
+    def test_splats_of_what_stands_still_beside_a_part_are_not_its_own(self):
+        """Below the laptop's screen lie its keys, three voxels from the box around the screen's points and less."""
+        obj, looks = looks_of("laptop")
+        pieces = Pieces(looks, SMALL.search, seed=0)
+        for cluster, held in zip(pieces.clusters, pieces.held, strict=True):
+            means = looks[cluster.state].splats.means[held].double()
+            base, screen = (
+                torch.stack([_beside(item.box, means) for item in part.at_state(cluster.state)]).amin(0) for part in obj.parts
+            )
+            assert float((base < screen - 0.5 * pieces.voxel).double().mean()) < 0.02
 
     def test_where_everything_seems_to_move_it_still_ends(self):
         looks = looks_of("laptop")[1]
@@ -1009,6 +1025,15 @@ class TestUndivided:
 
     def test_a_piece_that_belongs_to_another_part_keeps_its_cluster_divided(self):
         assert self.clusters(whole=0.7, five=0.0, seven=0.3, eight=0.2, elsewhere=5) == {2, 7, 8}
+
+
+def test_what_waits_is_not_given_up_for_a_part_that_explains_less():
+    waiting = {2: 0.005, 3: 0.001, 4: 0.007, 5: 0.009}
+    assert worth_more(waiting, {2, 3, 4}, 0.002) == 4
+    assert worth_more(waiting, {2, 3, 6}, 0.002) == 2
+    assert worth_more(waiting, {3, 6}, 0.002) is None
+    assert worth_more(waiting, {2, 3, 4}, 0.008) is None
+    assert worth_more({}, {2}, 0.0) is None
 
 
 class TestCutAcross:

@@ -68,6 +68,20 @@ def undivided(found: dict[int, Found], divisions: Sequence[Division], explained:
     return found
 
 
+def worth_more(waiting: dict[int, float], explains: set[int], worth: float) -> int | None:
+    """The waiting cluster that is itself worth most, of those that a part of less worth would explain; None if none is.
+
+    Such a part is a scrap of what waits, as the other state shows it, and would be all that is left of it.
+
+    Args:
+        waiting: what each waiting cluster is worth, by index.
+        explains: clusters that lie where the part is.
+        worth: of the part.
+    """
+    better = [index for index in explains & waiting.keys() if waiting[index] > worth]
+    return max(better, key=waiting.__getitem__, default=None)
+
+
 class PartSearch:
     """Turns clusters into moving parts, one after the other, the largest first."""
 
@@ -159,14 +173,14 @@ class PartSearch:
         refused: dict[int, tuple[int, float]] = {}
         count = len(self.pieces)
         todo = list(range(count))
-        waiting: set[int] = set()  # clusters that nothing fits well: those of the other state may tell what they hold
+        waiting: dict[int, float] = {}  # clusters that nothing fits well, and what it is worth: the other state may tell more
         waited: set[int] = set()
         while todo:
             index = todo.pop(0)
             yield min(index, count)
             parts = [one.part for one in found.values()]
             if index in waiting:
-                waiting.remove(index)
+                del waiting[index]
                 todo = self._left_of(index, parts) + todo
                 continue
             if index in explained:
@@ -177,15 +191,15 @@ class PartSearch:
                 explained |= members
                 todo = self._taken(part.state, [left.points] if left.pieces else []) + todo
                 continue
+            one = Found(part, -trial.cost(part.hypothesis))
             if unclear and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
-                waiting.add(index)
+                waiting[index] = one.worth
                 waited.add(index)
                 at_last = [*(i for i in todo if i in waiting), index]
                 todo = [i for i in todo if i not in waiting] + sorted(
                     at_last, key=lambda i: -len(self.pieces.clusters[i].points)
                 )
                 continue
-            one = Found(part, -trial.cost(part.hypothesis))
             worthy = part.gain > NOISE and one.worth > 0
             several = several_in(part, trial, self.pieces, index in self.pieces.apart) if worthy else [part.points]
             if len(several) > 1:
@@ -203,7 +217,12 @@ class PartSearch:
                 if unseen is None:
                     continue
                 one = replace(one, part=unseen)
-            explained |= members | {i for i in self.pieces.explained_by(one.part) if not self._known_apart(i, index)}
+            explains = members | {i for i in self.pieces.explained_by(one.part) if not self._known_apart(i, index)}
+            if (first := worth_more(waiting, explains, one.worth)) is not None:
+                del waiting[first]
+                todo = [first, index, *(i for i in todo if i != first)]
+                continue
+            explained |= explains
             found[index] = one
         self.left_over = [what for index, what in refused.items() if index not in explained]
         return [one.part for one in undivided(found, divisions, explained).values()]

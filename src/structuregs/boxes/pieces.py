@@ -68,7 +68,7 @@ class Pieces:
         views: of each state, which photos judge: some that are well apart.
         still: points of what stands still.
         base_box: around them.
-        moving: points of all clusters, by state.
+        told_apart: points of all clusters and of what stands still, by state.
         clusters: those that are to be explained, the largest first.
         boxes: of each cluster.
         held: of each cluster, its splats among its state's.
@@ -83,11 +83,13 @@ class Pieces:
         self.voxel = looks[0].hull.voxel
         self.views = [np.array(spread_cameras(look.stack.cameras, config.looks)) for look in looks]
         found = clusters(looks, config.cue)
-        still = self._still_points(found)
+        by_state = [self._still_points(found, state) for state in (0, 1)]
+        # All points of state 0 where clusters hold everything.
+        still = max(by_state, key=len) if any(map(len, by_state)) else looks[0].points
         self.base_box = box_around(still, thinnest=0.5 * self.voxel, axes=base_axes(looks))
         self.still = KDTree(still)
         moving = [[cluster.points for cluster in found if cluster.state == state] for state in (0, 1)]
-        self.moving = [KDTree(np.concatenate([np.zeros((0, 3)), *points])) for points in moving]
+        self.told_apart = [KDTree(np.concatenate([by_state[state], *moving[state]])) for state in (0, 1)]
         self.clusters: list[Cluster] = []
         self.boxes: list[Box] = []
         self.held: list[Bool[Tensor, " N"]] = []
@@ -100,16 +102,14 @@ class Pieces:
     def __len__(self) -> int:
         return len(self.clusters)
 
-    def _still_points(self, found: list[Cluster]) -> Float64[np.ndarray, "P 3"]:
-        """Points of either state that none of these clusters holds; all points of state 0 where they hold everything."""
-        rows = []
-        for state, look in enumerate(self.looks):
-            still = np.ones(len(look.points), bool)
-            for cluster in found:
-                if cluster.state == state:
-                    still &= ~self.box(cluster.points).contains(torch.from_numpy(look.points), margin=self.voxel).numpy()
-            rows.append(look.points[still])
-        return max(rows, key=len) if any(map(len, rows)) else self.looks[0].points
+    def _still_points(self, found: list[Cluster], state: int) -> Float64[np.ndarray, "P 3"]:
+        """Points of a state that none of these clusters holds."""
+        points = self.looks[state].points
+        still = np.ones(len(points), bool)
+        for cluster in found:
+            if cluster.state == state:
+                still &= ~self.box(cluster.points).contains(torch.from_numpy(points), margin=self.voxel).numpy()
+        return points[still]
 
     def take(self, cluster: Cluster) -> None:
         """Takes a cluster among those to explain, if the photos of its own state show it, and need it where they do."""
@@ -130,12 +130,12 @@ class Pieces:
         return box_around(points, thinnest=0.5 * self.voxel)
 
     def held_by(self, points: Float64[np.ndarray, "P 3"], state: int) -> Bool[Tensor, " N"]:
-        """Which splats of a state lie in the box of points or near it, and no nearer to what else moved."""
+        """Which splats of a state lie in the box of points or near it, and no nearer to what else moved or stands still."""
         means = self.looks[state].splats.means.double()
         held = self.box(points).contains(means, margin=self.config.clear * self.voxel)
         inside = means[held].numpy()
         held[held.clone()] = torch.from_numpy(
-            KDTree(points).query(inside)[0] < self.moving[state].query(inside)[0] + 0.5 * self.voxel
+            KDTree(points).query(inside)[0] < self.told_apart[state].query(inside)[0] + 0.5 * self.voxel
         )
         return held
 

@@ -212,10 +212,10 @@ class PartReview:
         shows = trial.shows(judged[0])
         alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
         alike &= (shows & lesser) | touching | self._agree(part, others, gaps, shows)
-        # A piece that continues a weightier part, and has no better motion of its own than that part's, belongs to it.
+        # A piece that continues a weightier part, or shows, and has no better motion of its own than that belongs to it.
         best_of_its_own = min(map(trial.burden, pulled[:own]))
         needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
-        alike |= needless & touching & lesser
+        alike |= needless & (touching | shows) & lesser
         little = _NO_SCRAP * part.weight
         if not shows and trial.explained(best) < little:  # nor has one that explains little, and loses little
             alike |= (losses < little) & touching & lesser
