@@ -155,9 +155,12 @@ class PartReview:
         trial, box = self._again(whole, rest), self.pieces.box
         ways = [trial.judge(h) for h in (leader.hypothesis, trial.moved(leader.hypothesis, follower.hypothesis.motion))]
         best = min(ways, key=lambda h: h.error)
-        alone = trial.there.error(self.pieces.splats_of(leader), best.motion)
-        if alone - best.image_error < self.config.shows * follower.weight and not self._continues(follower, leader):
-            return float("inf"), whole
+        if self._continues(follower, leader):  # as one they lie better than the greater did without the lesser
+            best = min(self.pieces.pulled(best, trial, self.config.steps), best, key=lambda h: h.error)
+        else:
+            alone = trial.there.error(self.pieces.splats_of(leader), best.motion)
+            if alone - best.image_error < self.config.shows * follower.weight:
+                return float("inf"), whole
         apart = trial.apart((self.pieces.splats_of(p), box(p.points), p.hypothesis.motion) for p in (leader, follower))
         gap = displacements(stack_motions([leader.hypothesis.motion]), follower.hypothesis.motion, box(follower.points))[0]
         allowed = self.config.alike * follower.weight if gap < self.config.same else 0.0
