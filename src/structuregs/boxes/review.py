@@ -154,16 +154,16 @@ class PartReview:
         (whole,) = self._merged(leader, follower, [])
         trial, box = self._again(whole, rest), self.pieces.box
         ways = [trial.judge(h) for h in (leader.hypothesis, trial.moved(leader.hypothesis, follower.hypothesis.motion))]
-        best = min(ways, key=lambda h: h.error)
-        if self._continues(follower, leader):  # as one they lie better than the greater did without the lesser
-            best = min(self.pieces.pulled(best, trial, self.config.steps), best, key=lambda h: h.error)
-        else:
+        gap = displacements(stack_motions([leader.hypothesis.motion]), follower.hypothesis.motion, box(follower.points))[0]
+        agree, best = gap < self.config.same, min(ways, key=lambda h: h.error)
+        if not self._continues(follower, leader):
             alone = trial.there.error(self.pieces.splats_of(leader), best.motion)
             if alone - best.image_error < self.config.shows * follower.weight:
                 return float("inf"), whole
+        elif not agree:  # the greater may lie askew where the lesser would hold it
+            best = min(self.pieces.pulled(best, trial, self.config.steps), best, key=lambda h: h.error)
         apart = trial.apart((self.pieces.splats_of(p), box(p.points), p.hypothesis.motion) for p in (leader, follower))
-        gap = displacements(stack_motions([leader.hypothesis.motion]), follower.hypothesis.motion, box(follower.points))[0]
-        allowed = self.config.alike * follower.weight if gap < self.config.same else 0.0
+        allowed = self.config.alike * follower.weight if agree else 0.0
         return best.error - apart - allowed, replace(whole, hypothesis=best)
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
