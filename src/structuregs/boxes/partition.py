@@ -210,22 +210,27 @@ class PartSearch:
                 continue
             share = len(part.points) / len(self.pieces.looks[part.state].points)
             large = share > self.config.large
-            if part.gain < (-self.config.harm if large else NOISE):
-                unseen = self._out_of_sight(part, trial, parts) if large else None
-                if large and unseen is None:
+            kept = self._kept(one, trial, parts, large)
+            if kept is None:
+                if large:
                     refused[index] = (part.state, share)
-                if unseen is None:
-                    continue
-                one = replace(one, part=unseen)
-            explains = members | {i for i in self.pieces.explained_by(one.part) if not self._known_apart(i, index)}
-            if (first := worth_more(waiting, explains, one.worth)) is not None:
+                continue
+            explains = members | {i for i in self.pieces.explained_by(kept.part) if not self._known_apart(i, index)}
+            if (first := worth_more(waiting, explains, kept.worth)) is not None:
                 del waiting[first]
                 todo = [first, index, *(i for i in todo if i != first)]
                 continue
             explained |= explains
-            found[index] = one
+            found[index] = kept
         self.left_over = [what for index, what in refused.items() if index not in explained]
         return [one.part for one in undivided(found, divisions, explained).values()]
+
+    def _kept(self, one: Found, trial: Trial, parts: list[MovingPart], large: bool) -> Found | None:
+        """What was found, if it explains enough; what is large need not, if it does little harm or came from out of sight."""
+        if one.part.gain >= (-self.config.harm if large else NOISE):
+            return one
+        unseen = self._out_of_sight(one.part, trial, parts) if large else None
+        return None if unseen is None else replace(one, part=unseen)
 
     def _is_open(self, state: int, todo: set[int]) -> bool:
         return any(self.pieces.clusters[index].state == state for index in todo)
