@@ -35,6 +35,7 @@ from structuregs.boxes.hypotheses import (
     hinge_screws,
     oddity,
     registrations,
+    square_with,
     stack_motions,
     turn_about,
 )
@@ -61,6 +62,7 @@ SMALL = StartConfig(
     search=SearchConfig(cue=CueConfig(neighbours=16), shortlist=30, finalists=4, looks=6, steps=30),
 )
 NO_MOTION = SE3.identity(dtype=F64)
+NOTHING = KDTree(np.zeros((0, 3)))
 
 
 def random_box(seed: int) -> Box:
@@ -148,6 +150,27 @@ class TestCandidates:
         assert gaps.min() > 0.9, "24 different turns"
         without, with_target = (candidate_motions([box], box, pairs) for pairs in ([], [(box, box.moved(true))]))
         assert len(with_target.wxyz_xyz) == len(without.wxyz_xyz) + 24
+
+    def test_a_round_door_s_hinge_goes_by_the_base(self):
+        """The least box around a disc may lie any way in its plane: here 30 degrees askew to its upright hinge."""
+        base = Box(SE3.identity(dtype=F64), torch.tensor([0.5, 0.5, 0.7], dtype=F64))
+        angles, radii = torch.rand(2, 2000, generator=torch.Generator().manual_seed(0), dtype=F64)
+        disc = 0.5 * radii.sqrt() * torch.stack([(2 * torch.pi * angles).cos(), (2 * torch.pi * angles).sin()])
+        points = torch.stack([disc[0], 0.04 * torch.arange(2000) % 2 - 0.58, disc[1]], 1)
+        askew = SE3.from_quat(
+            torch.tensor([np.cos(np.pi / 12), 0, np.sin(np.pi / 12), 0], dtype=F64), torch.zeros(3, dtype=F64)
+        )
+        box = box_around(points.numpy(), 0.01, axes=askew.rotation)
+        axes = square_with(box, 1, base)
+        assert axes is not None
+        torch.testing.assert_close(axes.T @ axes, torch.eye(3, dtype=F64))
+        assert float(torch.linalg.det(axes)) == pytest.approx(1)
+        square = box_around(points.numpy(), 0.01, axes=axes)
+        assert square_with(square, 1, base) is None
+        hinge = Screw("revolute", torch.tensor([0.0, 0, 1], dtype=F64), torch.tensor([0.5, -0.56, 0], dtype=F64))
+        true = hinge.motion(1.4)
+        near = [float(displacements(candidate_motions([one], base, []), true, box).min()) for one in (box, square)]
+        assert near[1] < 0.1 < 2 * near[1] < near[0]
 
     def test_hinges_are_the_edges_the_lines_between_and_some_beyond(self):
         box = random_box(1)
@@ -263,7 +286,7 @@ def test_a_turn_about_a_centre_leaves_it_where_it_is():
 
 def _beside(box: Box, points: Tensor) -> Tensor:
     """How far points are from a box, 0 inside."""
-    return (box.to_canonical(points).abs() - box.half_extents).clamp(min=0).norm(dim=-1)
+    return (box.T_world_box.inverse().apply(points).abs() - box.half_extents).clamp(min=0).norm(dim=-1)
 
 
 @lru_cache
@@ -329,7 +352,7 @@ def trial_of_screen() -> Trial:
         Scene(looks[s], looks[1 - s].splats[~inside[1 - s]], np.arange(0, 16, 2), KDTree(looks[s].points)) for s in (1, 0)
     )
     splats, own = looks[0].splats[inside[0]], KDTree(points_of(screen, 4000))
-    return Trial(there, here, looks[1].splats, splats, screen, 0.1, most=0.1, near=0.02, own=own, taken=None, least=0.01)
+    return Trial(there, here, looks[1].splats, splats, screen, 0.1, most=0.1, near=0.02, own=own, taken=NOTHING, least=0.01)
 
 
 def panels(box: Box, grey: float) -> Splats:
@@ -361,7 +384,7 @@ def cupboard_and_tray(pushed: float) -> Trial:
     pushed_in = [tray.moved(SE3.from_quat(NO_MOTION.wxyz, torch.tensor([-pushed, 0, 0], dtype=F64)))] if pushed else []
     there, here = scene_of([cupboard, *pushed_in], cupboard), scene_of([cupboard, tray], cupboard)
     own = KDTree(tray.means.numpy())
-    return Trial(there, here, cupboard, tray, box, weight=0.04, most=0.04, near=0.02, own=own, taken=None, least=0.002)
+    return Trial(there, here, cupboard, tray, box, weight=0.04, most=0.04, near=0.02, own=own, taken=NOTHING, least=0.002)
 
 
 def doors_above_each_other(lower: float, upper: float) -> tuple[Trial, Screw]:
@@ -384,7 +407,7 @@ def doors_above_each_other(lower: float, upper: float) -> tuple[Trial, Screw]:
     weight = here.absent - here.error(piece, NO_MOTION)
     own = KDTree(piece.means.double().numpy())
     box = box_around(own.data, 0.01)
-    trial = Trial(there, here, others, piece, box, weight, weight, 0.02, own, taken=None, least=0.1 * weight)
+    trial = Trial(there, here, others, piece, box, weight, weight, 0.02, own, taken=NOTHING, least=0.1 * weight)
     return trial, hinge
 
 
@@ -562,6 +585,33 @@ class TestParts:
                 torch.stack([_beside(item.box, means) for item in part.at_state(cluster.state)]).amin(0) for part in obj.parts
             )
             assert float((base < screen - 0.5 * pieces.voxel).double().mean()) < 0.02
+
+    def test_what_stands_in_both_states_is_not_brought_back_as_the_part(self):
+        """A screen that sinks into the base brings back less of it; laid upon its place it brings back itself."""
+        obj, looks = looks_of("laptop")
+        pieces = Pieces(looks, SMALL.search, seed=0)
+        beside = torch.stack([_beside(item.box, torch.from_numpy(pieces.stays)) for item in obj.parts[0].at_state(0)]).amin(0)
+        assert len(pieces.stays) > 500
+        assert float((beside < 2 * pieces.voxel).double().mean()) > 0.95
+        state = pieces.clusters[0].state
+        trial = pieces.trial(state, pieces.clusters[0].points, pieces.splats_in({0}), pieces.weights[0], [])
+        anything = replace(trial, taken=NOTHING)
+        into = slides_by([[0.0, 0.0, -d] for d in (0.2, 0.4, 0.6)])
+        wrong = [sum(len(one.brought(motion)) for motion in into) for one in (trial, anything)]
+        assert wrong[0] < 0.9 * wrong[1]
+        true = obj.joints[0].motion() if state == 0 else obj.joints[0].motion().inverse()
+        assert len(trial.brought(true)) > 0.95 * len(anything.brought(true))
+
+    def test_what_was_found_before_is_not_forgotten(self):
+        """Tried once more with fewer motions to choose from, a cluster keeps the better one that it was given before."""
+        obj, looks = looks_of("laptop")
+        search = PartSearch(looks, replace(SMALL.search, shortlist=1, finalists=1, steps=1), seed=0)
+        state = search.pieces.clusters[0].state
+        motion = obj.joints[0].motion() if state == 0 else obj.joints[0].motion().inverse()
+        known = Hypothesis(motion, 0.0, 0.0, 0.0), frozenset[int]()
+        part, members, _ = search._try(0, [], set(), known)
+        assert displacements(motion[None], part.hypothesis.motion, search.pieces.boxes[0])[0] < 0.1
+        assert members == {0}
 
     def test_where_everything_seems_to_move_it_still_ends(self):
         looks = looks_of("laptop")[1]

@@ -19,6 +19,7 @@ from ..points import Hull
 
 _ANGLES = torch.deg2rad(torch.arange(7.5, 181, 7.5, dtype=torch.float64))
 _LENGTHS = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.75, 2.0], dtype=torch.float64)
+_ALONG = np.cos(np.deg2rad(4))  # of two axes that are one
 
 
 @dataclass(frozen=True)
@@ -79,9 +80,26 @@ def slide_screws(box: Box, base: Box) -> list[Screw]:
     """Slides along the axes of the box, and along those of the base that differ from them."""
     axes = list(box.T_world_box.rotation.T)
     for axis in base.T_world_box.rotation.T:
-        if max(abs(float(axis @ other)) for other in axes) < np.cos(np.deg2rad(4)):
+        if max(abs(float(axis @ other)) for other in axes) < _ALONG:
             axes.append(axis)
     return [Screw("prismatic", axis, box.T_world_box.xyz) for axis in axes]
+
+
+def square_with(box: Box, axis: int, base: Box) -> Float64[Tensor, "3 3"] | None:
+    """The box's axes, as columns, turned about one of them to lie square with the base; None if they do.
+
+    Args:
+        box: in the world.
+        axis: which of its axes stays; of the base's axes, another comes to lie along the one most at right angles to it.
+        base: the base's box.
+    """
+    own, others = box.T_world_box.rotation, base.T_world_box.rotation
+    stays = own[:, axis]
+    across = others[:, int((stays @ others).abs().argmin())]
+    across = torch.nn.functional.normalize(across - (across @ stays) * stays, dim=0)
+    if float((across @ own).abs().max()) > _ALONG:
+        return None
+    return torch.stack([stays, across, torch.linalg.cross(stays, across)], 1)
 
 
 def registrations(box: Box, target: Box) -> list[SE3]:

@@ -150,7 +150,8 @@ class Trial:
         most: what it can explain of either: its weight, with that of what moves along.
         near: how far from the moved box splats count as lying there, world units.
         own: points of the part, in its own state.
-        taken: points of the other parts as they stand in the other state; None where they are not asked.
+        taken: points of what stands still in both states and, where they are asked, of the other parts as they stand in the
+            other; what is nearer to them is not the part's.
         least: a part shows in the other state if it takes this much off the error of its photos.
     """
 
@@ -163,7 +164,7 @@ class Trial:
     most: float
     near: float
     own: KDTree
-    taken: KDTree | None
+    taken: KDTree
     least: float
 
     @property
@@ -176,15 +177,17 @@ class Trial:
         return box.contains(self.others.means.double(), margin=self.near)
 
     def brought(self, motion: SE3) -> Splats:
-        """What lies in the other state where a motion takes the part, and no nearer to another part; still there."""
+        """What lies in the other state where a motion takes the part, and no nearer to what is something else; still there.
+
+        A slide into the base would bring back of its walls what lies there, as if the part had been that.
+        """
         lying = self.others[self._lying_in(self.box.moved(motion))]
         if not len(lying):
             return lying
         means = lying.means.double()
         from_own = self.own.query(motion.inverse().apply(means).numpy())[0]
         there = from_own < _HOLLOW * self.near
-        if self.taken is not None:
-            there &= from_own < self.taken.query(means.numpy())[0] + 0.5 * self.near
+        there &= from_own < self.taken.query(means.numpy())[0] + 0.5 * self.near
         return lying[torch.from_numpy(there)]
 
     @cached_property

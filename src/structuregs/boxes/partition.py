@@ -30,6 +30,10 @@ _TORN = 0.8  # of what a cluster explained as one part: several that explain les
 _CLAIM = 0.1  # of a cluster's points: so much of it moves along with a part found before, or it is tried as it is
 
 
+Known = tuple[Hypothesis, frozenset[int]]
+"""What a cluster was found to do, and the indices of those that move along."""
+
+
 @dataclass(frozen=True)
 class Found:
     """A part, and what it explains of both states' photos, less what speaks against its motion, in mean error."""
@@ -174,7 +178,7 @@ class PartSearch:
         count = len(self.pieces)
         todo = list(range(count))
         waiting: dict[int, float] = {}  # clusters that nothing fits well, and what it is worth: the other state may tell more
-        waited: set[int] = set()
+        waited: dict[int, Known] = {}
         while todo:
             index = todo.pop(0)
             yield min(index, count)
@@ -185,7 +189,7 @@ class PartSearch:
                 continue
             if index in explained:
                 continue
-            part, members, trial = self._try(index, parts, explained)
+            part, members, trial = self._try(index, parts, explained, waited.get(index))
             unclear = is_unclear(part, trial, self.config)
             if unclear and (left := self._claimed(part, found)) is not None:
                 explained |= members
@@ -194,11 +198,16 @@ class PartSearch:
             one = Found(part, -trial.cost(part.hypothesis))
             if unclear and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
                 waiting[index] = one.worth
-                waited.add(index)
+                waited[index] = part.hypothesis, frozenset(members)
                 at_last = [*(i for i in todo if i in waiting), index]
                 todo = [i for i in todo if i not in waiting] + sorted(
                     at_last, key=lambda i: -len(self.pieces.clusters[i].points)
                 )
+                continue
+            explains = members | {i for i in self.pieces.explained_by(part) if not self._known_apart(i, index)}
+            if (first := worth_more(waiting, explains, one.worth)) is not None:
+                del waiting[first]
+                todo = [first, index, *(i for i in todo if i != first)]
                 continue
             worthy = part.gain > NOISE and one.worth > 0
             several = several_in(part, trial, self.pieces, index in self.pieces.apart) if worthy else [part.points]
@@ -214,11 +223,6 @@ class PartSearch:
             if kept is None:
                 if large:
                     refused[index] = (part.state, share)
-                continue
-            explains = members | {i for i in self.pieces.explained_by(kept.part) if not self._known_apart(i, index)}
-            if (first := worth_more(waiting, explains, kept.worth)) is not None:
-                del waiting[first]
-                todo = [first, index, *(i for i in todo if i != first)]
                 continue
             explained |= explains
             found[index] = kept
@@ -260,8 +264,16 @@ class PartSearch:
             starts.append(Hypothesis(motions[m], float(outside[m]), float(unexplained[m]), odd))
         return starts, siblings
 
-    def _try(self, index: int, parts: list[MovingPart], done: set[int]) -> tuple[MovingPart, set[int], Trial]:
+    def _try(
+        self, index: int, parts: list[MovingPart], done: set[int], before: Known | None
+    ) -> tuple[MovingPart, set[int], Trial]:
         """The best motion of one cluster.
+
+        Args:
+            index: of the cluster.
+            parts: found so far.
+            done: clusters that belong to a part.
+            before: what it was found to do when it was tried before, if it was.
 
         Returns:
             The part, the indices of the clusters that move with it in its own state, and how it was tried.
@@ -295,6 +307,11 @@ class PartSearch:
             refined.append((pulled, group, trial.cost(pulled)))
         near = self.from_rest(index, alone, done)
         refined.append((near, frozenset(), alone.cost(near)))
+        if before is not None:
+            group = before[1] - done - {index}
+            trial = self._with(alone, index, group)
+            again = trial.judge(before[0])
+            refined.append((again, group, trial.cost(again)))
         best = min(refined, key=lambda row: row[2])[0]
         if (unseen := just_out_of_sight(best, alone, pieces.base_box)) is not best:
             refined.append((unseen, frozenset(), alone.cost(unseen)))
@@ -356,4 +373,4 @@ class PartSearch:
         largest = indices[: self.config.together]
         groups = {frozenset(always | set(some)) for n in (0, 1, 2, len(largest)) for some in itertools.combinations(largest, n)}
         points = [np.concatenate([self.pieces.clusters[i].points for i in sorted(g)]) for g in sorted(groups, key=sorted) if g]
-        return [self.pieces.box(p) for p in points]
+        return [box for p in points for box in self.pieces.boxes_around(p)]

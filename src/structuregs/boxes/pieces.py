@@ -13,9 +13,11 @@ from ..geometry import SE3, Box
 from ..model import Splats
 from .config import SearchConfig
 from .cue import Cluster, Points, StateLook, base_axes, box_around, clusters
-from .hypotheses import Hypothesis
+from .hypotheses import Hypothesis, square_with
 from .judge import Scene, Trial
 from .refine import along_base, refine, simplest
+
+_ABOUT_AS_TIGHT = 1.3  # volume of another box around the same points, against the least; a square's, cut across, is 2
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class Pieces:
         views: of each state, which photos judge: some that are well apart.
         still: points of what stands still.
         base_box: around them.
+        stays: points of what both states show standing still in one place.
         told_apart: points of all clusters and of what stands still, by state.
         clusters: those that are to be explained, the largest first.
         boxes: of each cluster.
@@ -90,6 +93,7 @@ class Pieces:
         self.still = KDTree(still)
         moving = [[cluster.points for cluster in found if cluster.state == state] for state in (0, 1)]
         self.told_apart = [KDTree(np.concatenate([by_state[state], *moving[state]])) for state in (0, 1)]
+        self.stays = _in_both(by_state[0], by_state[1], self.voxel)
         self.clusters: list[Cluster] = []
         self.boxes: list[Box] = []
         self.held: list[Bool[Tensor, " N"]] = []
@@ -128,6 +132,17 @@ class Pieces:
     def box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
         """The box around points."""
         return box_around(points, thinnest=0.5 * self.voxel)
+
+    def boxes_around(self, points: Float64[np.ndarray, "P 3"]) -> list[Box]:
+        """The box around points, and those that share one of its axes, lie square with the base and are about as tight.
+
+        The least box around a round door may lie any way in its plane, but its hinge goes by the base.
+        """
+        box = self.box(points)
+        thinnest, most = 0.5 * self.voxel, _ABOUT_AS_TIGHT * box.volume
+        turned = (square_with(box, axis, self.base_box) for axis in range(3))
+        squared = [box_around(points, thinnest, axes=axes) for axes in turned if axes is not None]
+        return [box, *(one for one in squared if one.volume < most)]
 
     def held_by(self, points: Float64[np.ndarray, "P 3"], state: int) -> Bool[Tensor, " N"]:
         """Which splats of a state lie in the box of points or near it, and no nearer to what else moved or stands still."""
@@ -181,7 +196,7 @@ class Pieces:
             most=weight,
             near=self.voxel,
             own=KDTree(points),
-            taken=None,
+            taken=KDTree(self.stays),
             least=self.config.shows * weight,
         )
 
@@ -213,3 +228,8 @@ class Pieces:
         """Clusters of either state that lie where the part is in that state."""
         clusters = enumerate(self.clusters)
         return {index for index, cluster in clusters if float(self.within(part, cluster).double().mean()) > 0.6}
+
+
+def _in_both(one: Points, two: Points, gap: float) -> Points:
+    """What each of two sets has nearer than `gap` to a point of the other."""
+    return np.concatenate([points[KDTree(others).query(points)[0] < gap] for points, others in ((one, two), (two, one))])
