@@ -249,7 +249,8 @@ class PartSearch:
         arrivals = self._arrivals(index, done)
         siblings = [i for i in open_ if pieces.clusters[i].state == state and i != index and not self._known_apart(i, index)]
         wholes = self._unions(siblings, {index})
-        motions = candidate_motions(wholes, pieces.base_box, list(itertools.product(wholes, self._unions(arrivals, set()))))
+        pairs = list(itertools.product(wholes, self._unions(arrivals, set())))
+        motions = candidate_motions([*wholes, *pieces.squared(cluster.points)], pieces.base_box, pairs)
         rough = hull_scores(motions, pieces.sample(cluster.points, 40), hull, nothing, box)[0]
         motions = motions[np.flatnonzero(rough < rough.min() + 1.0)]
         points, landing = pieces.sample(cluster.points, 300), pieces.sample(self._landing(arrivals), 300)
@@ -373,4 +374,4 @@ class PartSearch:
         largest = indices[: self.config.together]
         groups = {frozenset(always | set(some)) for n in (0, 1, 2, len(largest)) for some in itertools.combinations(largest, n)}
         points = [np.concatenate([self.pieces.clusters[i].points for i in sorted(g)]) for g in sorted(groups, key=sorted) if g]
-        return [box for p in points for box in self.pieces.boxes_around(p)]
+        return [self.pieces.box(p) for p in points]
