@@ -590,8 +590,10 @@ class TestParts:
         """A screen that sinks into the base brings back less of it; laid upon its place it brings back itself."""
         obj, looks = looks_of("laptop")
         pieces = Pieces(looks, SMALL.search, seed=0)
-        beside = torch.stack([_beside(item.box, torch.from_numpy(pieces.stays)) for item in obj.parts[0].at_state(0)]).amin(0)
-        assert len(pieces.stays) > 500
+        beside = torch.stack(
+            [_beside(item.box, torch.from_numpy(pieces.stays.data)) for item in obj.parts[0].at_state(0)]
+        ).amin(0)
+        assert len(pieces.stays.data) > 500
         assert float((beside < 2 * pieces.voxel).double().mean()) > 0.95
         state = pieces.clusters[0].state
         trial = pieces.trial(state, pieces.clusters[0].points, pieces.splats_in({0}), pieces.weights[0], [])

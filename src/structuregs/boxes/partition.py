@@ -198,7 +198,7 @@ class PartSearch:
             one = Found(part, -trial.cost(part.hypothesis))
             if unclear and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
                 waiting[index] = one.worth
-                waited[index] = part.hypothesis, frozenset(members)
+                waited[index] = part.hypothesis, frozenset(members - {index})
                 at_last = [*(i for i in todo if i in waiting), index]
                 todo = [i for i in todo if i not in waiting] + sorted(
                     at_last, key=lambda i: -len(self.pieces.clusters[i].points)
@@ -250,7 +250,7 @@ class PartSearch:
         siblings = [i for i in open_ if pieces.clusters[i].state == state and i != index and not self._known_apart(i, index)]
         wholes = self._unions(siblings, {index})
         pairs = list(itertools.product(wholes, self._unions(arrivals, set())))
-        motions = candidate_motions([*wholes, *pieces.squared(cluster.points)], pieces.base_box, pairs)
+        motions = candidate_motions([*wholes, *pieces.squared(index)], pieces.base_box, pairs)
         rough = hull_scores(motions, pieces.sample(cluster.points, 40), hull, nothing, box)[0]
         motions = motions[np.flatnonzero(rough < rough.min() + 1.0)]
         points, landing = pieces.sample(cluster.points, 300), pieces.sample(self._landing(arrivals), 300)
@@ -309,7 +309,7 @@ class PartSearch:
         near = self.from_rest(index, alone, done)
         refined.append((near, frozenset(), alone.cost(near)))
         if before is not None:
-            group = before[1] - done - {index}
+            group = before[1] - done
             trial = self._with(alone, index, group)
             again = trial.judge(before[0])
             refined.append((again, group, trial.cost(again)))

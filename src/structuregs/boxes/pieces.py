@@ -93,7 +93,7 @@ class Pieces:
         self.still = KDTree(still)
         moving = [[cluster.points for cluster in found if cluster.state == state] for state in (0, 1)]
         self.told_apart = [KDTree(np.concatenate([by_state[state], *moving[state]])) for state in (0, 1)]
-        self.stays = _in_both(by_state[0], by_state[1], self.voxel)
+        self.stays = KDTree(_in_both(by_state[0], by_state[1], self.voxel))
         self.clusters: list[Cluster] = []
         self.boxes: list[Box] = []
         self.held: list[Bool[Tensor, " N"]] = []
@@ -133,12 +133,12 @@ class Pieces:
         """The box around points."""
         return box_around(points, thinnest=0.5 * self.voxel)
 
-    def squared(self, points: Float64[np.ndarray, "P 3"]) -> list[Box]:
-        """Boxes around points that share one axis with the least, lie square with the base, and are about as tight.
+    def squared(self, index: int) -> list[Box]:
+        """Boxes around a cluster that share one axis with its own, lie square with the base, and are about as tight.
 
         The least box around a round door may lie any way in its plane, but its hinge goes by the base.
         """
-        box = self.box(points)
+        points, box = self.clusters[index].points, self.boxes[index]
         turned = (square_with(box, axis, self.base_box) for axis in range(3))
         boxes = [box_around(points, 0.5 * self.voxel, axes=axes) for axes in turned if axes is not None]
         return [one for one in boxes if one.volume < _ABOUT_AS_TIGHT * box.volume]
@@ -195,7 +195,7 @@ class Pieces:
             most=weight,
             near=self.voxel,
             own=KDTree(points),
-            taken=KDTree(self.stays),
+            taken=self.stays,
             least=self.config.shows * weight,
         )
 

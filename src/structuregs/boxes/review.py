@@ -326,4 +326,4 @@ class PartReview:
         """A part between the photos of both states, with all other parts in place."""
         trial = self.pieces.trial(part.state, part.points, self.pieces.splats_of(part), part.weight, others)
         taken = [other.points_in(1 - part.state) for other in others]
-        return replace(trial, taken=KDTree(np.concatenate([self.pieces.stays, *taken])))
+        return replace(trial, taken=KDTree(np.concatenate([self.pieces.stays.data, *taken])))
