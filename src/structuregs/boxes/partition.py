@@ -204,7 +204,7 @@ class PartSearch:
                     at_last, key=lambda i: -len(self.pieces.clusters[i].points)
                 )
                 continue
-            explains = members | {i for i in self.pieces.explained_by(part) if not self._known_apart(i, index)}
+            explains = members | self._explained_by(part, index)
             if (first := worth_more(waiting, explains, one.worth)) is not None:
                 del waiting[first]
                 todo = [first, index, *(i for i in todo if i != first)]
@@ -224,7 +224,7 @@ class PartSearch:
                 if large:
                     refused[index] = (part.state, share)
                 continue
-            explained |= explains
+            explained |= explains if kept is one else members | self._explained_by(kept.part, index)
             found[index] = kept
         self.left_over = [what for index, what in refused.items() if index not in explained]
         return [one.part for one in undivided(found, divisions, explained).values()]
@@ -365,6 +365,10 @@ class PartSearch:
         everything = scene.error(self.pieces.splats_in({index, *group}), best.motion)
         without = {i: scene.error(self.pieces.splats_in({index, *group} - {i}), best.motion) for i in group}
         return {i for i, error in without.items() if error - everything > self.config.shown * self.pieces.weights[i]}
+
+    def _explained_by(self, part: MovingPart, index: int) -> set[int]:
+        """The clusters that lie where a part is, but for those known to be other parts than its cluster."""
+        return {i for i in self.pieces.explained_by(part) if not self._known_apart(i, index)}
 
     def _known_apart(self, one: int, other: int) -> bool:
         return one in self.pieces.apart and self.pieces.apart[one] == self.pieces.apart.get(other)
