@@ -40,8 +40,8 @@ from structuregs.boxes.hypotheses import (
     turn_about,
 )
 from structuregs.boxes.judge import Scene, Trial
-from structuregs.boxes.partition import Division, Found, undivided, worth_more
 from structuregs.boxes.pieces import Pieces
+from structuregs.boxes.progress import Division, Found, undivided, worth_more
 from structuregs.boxes.refine import along_base, just_out_of_sight, refine, shortest_out_of_sight, simplest
 from structuregs.boxes.review import PartReview
 from structuregs.boxes.several import _ways, several_in

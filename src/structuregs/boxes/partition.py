@@ -1,8 +1,8 @@
 """From clusters of what moved to moving parts: each a box in state 0 and the motion that the photos like best."""
 
 import itertools
-from collections.abc import Generator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Generator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,68 +22,12 @@ from .hypotheses import (
 )
 from .judge import NOISE, Scene, Trial
 from .pieces import MovingPart, Pieces
+from .progress import Division, Found, Known, Progress, undivided, worth_more
 from .refine import just_out_of_sight, measured, shortest_out_of_sight
 from .review import PartReview
 from .several import is_unclear, several_in
 
-_TORN = 0.8  # of what a cluster explained as one part: several that explain less together are that part, torn to pieces
 _CLAIM = 0.1  # of a cluster's points: so much of it moves along with a part found before, or it is tried as it is
-
-
-Known = tuple[Hypothesis, frozenset[int]]
-"""What a cluster was found to do, and the indices of those that move along."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """A part, and what it explains of both states' photos, less what speaks against its motion, in mean error."""
-
-    part: MovingPart
-    worth: float
-
-
-@dataclass(frozen=True)
-class Division:
-    """A cluster taken for several parts: what it was as one, and the indices of the clusters in its place."""
-
-    index: int
-    whole: Found
-    pieces: list[int]
-
-
-def undivided(found: dict[int, Found], divisions: Sequence[Division], explained: set[int]) -> dict[int, Found]:
-    """What was found, by clusters; one that explained clearly more as a whole than its pieces do is one part again.
-
-    Args:
-        found: by the index of its cluster.
-        divisions: in the order in which they were made; a piece may have been divided in its turn.
-        explained: clusters that belong to a part; a piece among them that is no part belongs to another's, and the cluster
-            that held it stays divided.
-    """
-    found = dict(found)
-    ends: dict[int, list[int]] = {}  # of clusters that were divided: what became of them
-    for division in reversed(divisions):
-        pieces = [end for index in division.pieces for end in ends.get(index, [index])]
-        worth = sum(found[index].worth for index in pieces if index in found)
-        if worth < _TORN * division.whole.worth and explained.isdisjoint(set(pieces) - found.keys()):
-            found = {index: one for index, one in found.items() if index not in pieces}
-            found[division.index], pieces = division.whole, [division.index]
-        ends[division.index] = pieces
-    return found
-
-
-def worth_more(waiting: dict[int, float], explains: set[int], worth: float) -> int | None:
-    """The waiting cluster that is itself worth most, of those that a part of less worth would explain; None if none is.
-
-    Such a part is a scrap of what waits, as the other state shows it, and would be all that is left of it.
-
-    Args:
-        waiting: what each waiting cluster is worth, by index.
-        explains: clusters that lie where the part is.
-        worth: of the part.
-    """
-    better = [index for index in explains & waiting.keys() if waiting[index] > worth]
-    return max(better, key=waiting.__getitem__, default=None)
 
 
 class PartSearch:
@@ -171,63 +115,52 @@ class PartSearch:
 
     def _found(self) -> Generator[int, None, list[MovingPart]]:
         """The parts as they are found, one after the other."""
-        found: dict[int, Found] = {}
-        divisions: list[Division] = []
-        explained: set[int] = set()
-        refused: dict[int, tuple[int, float]] = {}
         count = len(self.pieces)
-        todo = list(range(count))
-        waiting: dict[int, float] = {}  # clusters that nothing fits well, and what it is worth: the other state may tell more
-        waited: dict[int, Known] = {}
-        while todo:
-            index = todo.pop(0)
+        so_far = Progress(list(range(count)))
+        while so_far.todo:
+            index = so_far.todo.pop(0)
             yield min(index, count)
-            parts = [one.part for one in found.values()]
-            if index in waiting:
-                del waiting[index]
-                todo = self._left_of(index, parts) + todo
-                continue
-            if index in explained:
-                continue
-            part, members, trial = self._try(index, parts, explained, waited.get(index))
-            unclear = is_unclear(part, trial, self.config)
-            if unclear and (left := self._claimed(part, found)) is not None:
-                explained |= members
-                todo = self._taken(part.state, [left.points] if left.pieces else []) + todo
-                continue
-            one = Found(part, -trial.cost(part.hypothesis))
-            if unclear and index not in waited and self._is_open(1 - part.state, set(todo) - explained):
-                waiting[index] = one.worth
-                waited[index] = part.hypothesis, frozenset(members - {index})
-                at_last = [*(i for i in todo if i in waiting), index]
-                todo = [i for i in todo if i not in waiting] + sorted(
-                    at_last, key=lambda i: -len(self.pieces.clusters[i].points)
-                )
-                continue
-            explains = members | self._explained_by(part, index)
-            if (first := worth_more(waiting, explains, one.worth)) is not None:
-                del waiting[first]
-                todo = [first, index, *(i for i in todo if i != first)]
-                continue
-            worthy = part.gain > NOISE and one.worth > 0
-            several = several_in(part, trial, self.pieces, index in self.pieces.apart) if worthy else [part.points]
-            if len(several) > 1:
-                explained |= members
-                new = self._replaced(min(members), several)
-                divisions.append(Division(index, one, new))
-                todo = new + todo
-                continue
-            share = len(part.points) / len(self.pieces.looks[part.state].points)
-            large = share > self.config.large
-            kept = self._kept(one, trial, parts, large)
-            if kept is None:
-                if large:
-                    refused[index] = (part.state, share)
-                continue
-            explained |= explains if kept is one else members | self._explained_by(kept.part, index)
-            found[index] = kept
-        self.left_over = [what for index, what in refused.items() if index not in explained]
-        return [one.part for one in undivided(found, divisions, explained).values()]
+            if so_far.waiting.pop(index, None) is not None:
+                so_far.put_first(self._left_of(index, so_far.parts))
+            elif index not in so_far.explained:
+                self._look_at(index, so_far)
+        self.left_over = [what for index, what in so_far.refused.items() if index not in so_far.explained]
+        return [one.part for one in undivided(so_far.found, so_far.divisions, so_far.explained).values()]
+
+    def _look_at(self, index: int, so_far: Progress) -> None:
+        """Makes a part of a cluster, or several; or leaves it to others, or puts it off."""
+        part, members, trial = self._try(index, so_far.parts, so_far.explained, so_far.known.get(index))
+        unclear = is_unclear(part, trial, self.config)
+        if unclear and (left := self._claimed(part, so_far.found)) is not None:
+            so_far.explained |= members
+            so_far.put_first(self._taken(part.state, [left.points] if left.pieces else []))
+            return
+        one = Found(part, -trial.cost(part.hypothesis))
+        if unclear and index not in so_far.known and self._is_open(1 - part.state, so_far):
+            so_far.known[index] = part.hypothesis, frozenset(members - {index})
+            so_far.put_off(index, one.worth, [len(cluster.points) for cluster in self.pieces.clusters])
+            return
+        explains = members | self._explained_by(part, index)
+        if (first := worth_more(so_far.waiting, explains, one.worth)) is not None:
+            del so_far.waiting[first]
+            so_far.put_first([first, index])
+            return
+        worthy = part.gain > NOISE and one.worth > 0
+        several = several_in(part, trial, self.pieces, index in self.pieces.apart) if worthy else [part.points]
+        if len(several) > 1:
+            so_far.explained |= members
+            new = self._replaced(min(members), several)
+            so_far.divisions.append(Division(index, one, new))
+            so_far.put_first(new)
+            return
+        share = len(part.points) / len(self.pieces.looks[part.state].points)
+        large = share > self.config.large
+        kept = self._kept(one, trial, so_far.parts, large)
+        if kept is not None:
+            so_far.explained |= explains if kept is one else members | self._explained_by(kept.part, index)
+            so_far.found[index] = kept
+        elif large:
+            so_far.refused[index] = (part.state, share)
 
     def _kept(self, one: Found, trial: Trial, parts: list[MovingPart], large: bool) -> Found | None:
         """What was found, if it explains enough; what is large need not, if it does little harm or came from out of sight."""
@@ -236,8 +169,8 @@ class PartSearch:
         unseen = self._out_of_sight(one.part, trial, parts) if large else None
         return None if unseen is None else replace(one, part=unseen)
 
-    def _is_open(self, state: int, todo: set[int]) -> bool:
-        return any(self.pieces.clusters[index].state == state for index in todo)
+    def _is_open(self, state: int, so_far: Progress) -> bool:
+        return any(self.pieces.clusters[index].state == state for index in set(so_far.todo) - so_far.explained)
 
     def _shortlist(self, index: int, done: set[int]) -> tuple[list[Hypothesis], list[int]]:
         """Motions that the other state's hull allows a cluster, the best first, and the clusters that may move with it."""
