@@ -135,6 +135,25 @@ def test_a_plain_face_tells_nothing():
     assert Face.most_shown(plain).alike_at() is None
 
 
+def test_photos_that_cannot_be_asked_by_halves_say_where_a_face_is_likeliest():
+    """All of them of one half, as where few see the face."""
+    wrong = beside(2.0, -1.0, 0.0)
+    found = overlap(wrong)
+    face = Face.most_shown(found.of(found.pixels[:, 0] % 2 == 0))
+    assert face.alike_at() is None
+    place = face.likeliest()
+    assert place is not None
+    error = (face.laid(place).apply(BOX.corners) - TRUE.apply(BOX.corners)).norm(dim=-1)
+    assert float(error.max()) < 0.25 * UNIT
+
+
+def test_a_face_that_is_where_it_was_found_is_likeliest_there_and_a_plain_one_nowhere():
+    place = Face.most_shown(overlap(TRUE)).likeliest()
+    assert place is not None
+    assert np.linalg.norm(place) < 0.25
+    assert Face.most_shown(overlap(beside(1.5, 0, 0), pattern=PLAIN)).likeliest() is None
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_photos_that_show_something_else_tell_nothing(seed: int):
     """Somewhere even faces with nothing in common are most alike, but either half of the photos finds a place of its own."""

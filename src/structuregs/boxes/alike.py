@@ -305,6 +305,16 @@ class Face:
         """The motion of the part with the face at a place."""
         return SE3.from_matrix(torch.from_numpy(self.moved(place))) @ self.overlap.motion
 
+    def likeliest(self) -> Float64[np.ndarray, " 3"] | None:
+        """The place where all photos of the face together are most alike; None if they are not clearly less alike around it.
+
+        Not so sure as `alike_at`, which asks them by halves: enough to doubt where the face is, not to lay it elsewhere.
+        """
+        if len(self.overlap) < _FEWEST:
+            return None
+        place = self.nearby(self.place())
+        return place if np.abs(place).max() < _REACH - 0.5 and self.stands_out(place) else None
+
     def alike_at(self) -> Float64[np.ndarray, " 3"] | None:
         """The place where the photos of the face are alike.
 

@@ -194,9 +194,9 @@ def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject
     Photos of one state are laid upon those of the other, as the model says where each pixel went.  They leave at most as much
     of what varies unexplained as if nothing were laid there; where they leave more than that, what one state shows is not
     where the other has it.  The factor is 1 up to there, 0 from 1.4 times that on, of the worse of both directions.  A second
-    one is 1 unless photos are clearly more alike with the part elsewhere in the plane of its face (`Face.alike_at`), more than
-    half a unit away (.7 at most of parts that are clearly right), and 0 from 2.5 units on.  Where that makes a joint doubtful,
-    a sentence asks for a look.  Parts that no photos of both states show say nothing.
+    one is 1 unless photos are most alike with the part elsewhere in the plane of its face (`Face.likeliest`), more than half a
+    unit away (.7 at most of parts that are right, 1.6 and 1.7 of wrong ones), and 0 from 2.5 units on.  Where that makes a
+    joint doubtful, a sentence asks for a look.  Parts that no photos of both states show say nothing.
 
     Args:
         obj: as fitted.
@@ -215,8 +215,8 @@ def alike_in_both(obj: ArticulatedObject, capture: Capture) -> ArticulatedObject
 
 
 def _better_place(overlap: Overlap) -> float:
-    """How many units away photos of the two states are clearly more alike; 0 where no such place is found."""
-    place = Face.most_shown(overlap).alike_at()
+    """How many units away photos of the two states are most alike; 0 where they do not say."""
+    place = Face.most_shown(overlap).likeliest()
     return 0.0 if place is None else float(np.linalg.norm(place))
 
 
