@@ -965,6 +965,20 @@ class TestReview:
         monkeypatch.setattr(review, "_continues", lambda *_: continues)
         assert len(review.joined(pieces)) == (1 if continues else 2)
 
+    @pytest.mark.parametrize(("times", "count"), [(1, 1), (100, 2)])
+    def test_what_does_not_show_is_not_carried_off_by_a_lesser_piece(
+        self, times: int, count: int, monkeypatch: pytest.MonkeyPatch
+    ):
+        """As a tray by a scrap of its door; of what is a hundred times as heavy the other state shows as good as nothing."""
+        review, right, wrong = self.found()
+        left = right.points[:, 0] < 0.5
+        large = replace(
+            wrong, pieces=(right.points[left],), weight=times * right.weight
+        )  # so heavy that it shows nothing of it
+        small = replace(right, pieces=(right.points[~left],), weight=0.1 * right.weight)
+        monkeypatch.setattr(review, "_continues", lambda *_: False)
+        assert len(review.joined([large, small])) == count
+
     @pytest.mark.parametrize(("explains", "count"), [(0.4, 1), (0.6, 2)])
     def test_a_piece_that_explains_little_moves_as_what_it_continues(
         self, explains: float, count: int, monkeypatch: pytest.MonkeyPatch

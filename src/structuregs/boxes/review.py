@@ -147,24 +147,33 @@ class PartReview:
     def _as_one(self, one: MovingPart, two: MovingPart, rest: list[MovingPart]) -> tuple[float, MovingPart]:
         """What speaks against two parts of one state being one, in mean error (below 0: nothing), and the two as one.
 
-        The lesser has to show in the other state, moved like the whole, or to continue the greater: wherever it goes unseen,
-        as a tray does behind a door, it would do no harm.
+        Of the two, whichever is to move like the other has to show where that brings it, or the lesser has to continue the
+        greater: wherever it goes unseen, as a tray does behind a door, it would do no harm.
         """
         follower, leader = sorted((one, two), key=lambda part: part.weight)
         (whole,) = self._merged(leader, follower, [])
         trial, box = self._again(whole, rest), self.pieces.box
-        ways = [trial.judge(h) for h in (leader.hypothesis, trial.moved(leader.hypothesis, follower.hypothesis.motion))]
+        own, other = (trial.judge(h) for h in (leader.hypothesis, trial.moved(leader.hypothesis, follower.hypothesis.motion)))
         gap = displacements(stack_motions([leader.hypothesis.motion]), follower.hypothesis.motion, box(follower.points))[0]
-        agree, best = gap < self.config.same, min(ways, key=lambda h: h.error)
-        if not self._continues(follower, leader):
-            alone = trial.there.error(self.pieces.splats_of(leader), best.motion)
-            if alone - best.image_error < self.config.shows * follower.weight:
-                return float("inf"), whole
-        elif not agree:  # the greater may lie askew where the lesser would hold it
+        agree, continues = gap < self.config.same, self._continues(follower, leader)
+        ways = [own, other]
+        if not continues:
+            seen = [self._seen_along(follower, leader, trial, h) for h in ways]
+            seen[1] &= agree or self._seen_along(leader, follower, trial, other)
+            ways = list(itertools.compress(ways, seen))
+        if not ways:
+            return float("inf"), whole
+        best = min(ways, key=lambda h: h.error)
+        if continues and not agree:  # the greater may lie askew where the lesser would hold it
             best = min(self.pieces.pulled(best, trial, self.config.steps), best, key=lambda h: h.error)
         apart = trial.apart((self.pieces.splats_of(p), box(p.points), p.hypothesis.motion) for p in (leader, follower))
         allowed = self.config.alike * follower.weight if agree else 0.0
         return best.error - apart - allowed, replace(whole, hypothesis=best)
+
+    def _seen_along(self, part: MovingPart, other: MovingPart, trial: Trial, hypothesis: Hypothesis) -> bool:
+        """Whether photos of the other state show a part that moves as one with another; `trial` is that of both."""
+        alone = trial.there.error(self.pieces.splats_of(other), hypothesis.motion)
+        return alone - hypothesis.image_error >= self.config.shows * part.weight
 
     def _reconsider(self, parts: list[MovingPart]) -> list[MovingPart]:
         """Looks at each part again with all others in place; one that may as well move like another becomes one with it."""
