@@ -972,9 +972,7 @@ class TestReview:
         """As a tray by a scrap of its door; of what is a hundred times as heavy the other state shows as good as nothing."""
         review, right, wrong = self.found()
         left = right.points[:, 0] < 0.5
-        large = replace(
-            wrong, pieces=(right.points[left],), weight=times * right.weight
-        )  # so heavy that it shows nothing of it
+        large = replace(wrong, pieces=(right.points[left],), weight=times * right.weight)
         small = replace(right, pieces=(right.points[~left],), weight=0.1 * right.weight)
         monkeypatch.setattr(review, "_continues", lambda *_: False)
         assert len(review.joined([large, small])) == count

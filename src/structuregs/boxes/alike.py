@@ -313,7 +313,7 @@ class Face:
         if len(self.overlap) < _FEWEST:
             return None
         place = self.nearby(self.place())
-        return place if np.abs(place).max() < _REACH - 0.5 and self.stands_out(place) else None
+        return place if not _at_the_rim(place) and self.stands_out(place) else None
 
     def alike_at(self) -> Float64[np.ndarray, " 3"] | None:
         """The place where the photos of the face are alike.
@@ -326,7 +326,7 @@ class Face:
         if min(len(half.overlap) for half in halves) < _FEWEST:
             return None
         flat = [half.place() for half in halves]
-        if np.linalg.norm(flat[0] - flat[1]) > _TOGETHER or np.abs(flat).max() > _REACH - 0.5:  # may be likelier still beyond
+        if np.linalg.norm(flat[0] - flat[1]) > _TOGETHER or any(map(_at_the_rim, flat)):
             return None
         turned = [half.turned(place) for half, place in zip(halves, flat, strict=True)]
         left, left_turned = (_left_of_each_other(halves, places) for places in (flat, turned))
@@ -336,6 +336,11 @@ class Face:
         if left > _BETTER or self.unlike(place) > _ALIKE or not self.stands_out(place):
             return None
         return place
+
+
+def _at_the_rim(place: Float64[np.ndarray, " 3"]) -> bool:
+    """Whether a face was looked for hardly farther than a place: it may be likelier still beyond."""
+    return bool(np.abs(place).max() > _REACH - 0.5)
 
 
 def _left_of_each_other(halves: Sequence[Face], places: Sequence[Float64[np.ndarray, " 3"]]) -> float:
