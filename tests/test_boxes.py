@@ -954,6 +954,26 @@ class TestReview:
         unseen = replace(taker, weight=100 * right.weight)  # so heavy that what the other state shows of it is nothing
         assert [len(part.points) for part in review.exchanged([unseen, giver])] == [left.sum(), (~left).sum()]
 
+    def test_what_of_a_part_goes_another_s_way_is_handed_over_though_that_lies_a_little_off(self):
+        """Half of the screen is taken for the base's, and the other half turns too little for the exchange to tell."""
+        review, right, wrong = self.found()
+        points, base = right.points, review.pieces.looks[right.state].points
+        left = points[:, 0] < 0
+        base = base[KDTree(points).query(base)[0] > 3 * review.pieces.voxel]
+        turn, q = screw_at(right.hypothesis.motion, "revolute", torch.zeros(3, dtype=F64))
+        less = replace(right.hypothesis, motion=turn.motion(0.75 * q))
+        like = replace(right, pieces=(points[left],), hypothesis=less)
+        part = replace(wrong, pieces=(points[~left], base), weight=0.5 * right.weight)
+        assert [len(one.points) for one in review.exchanged([like, part])] == [left.sum(), (~left).sum() + len(base)]
+        handed = review._handed_over(part, like, right.hypothesis, [like, part])
+        assert handed is not None
+        assert [len(one.points) for one in handed] == pytest.approx([len(points), len(base)], abs=0.1 * len(points))
+        assert handed[0].hypothesis is less, "where it lies is asked again"
+        whole = replace(part, pieces=(points[~left],))
+        assert review._handed_over(whole, like, right.hypothesis, [like, whole]) is None, "nothing would be left of it"
+        elsewhere = replace(part, state=1 - part.state)
+        assert review._handed_over(elsewhere, like, right.hypothesis, [like, elsewhere]) is None
+
     @pytest.mark.parametrize("continues", [True, False])
     def test_a_piece_that_the_other_state_does_not_show_is_one_only_with_what_it_continues(
         self, continues: bool, monkeypatch: pytest.MonkeyPatch

@@ -193,10 +193,37 @@ class PartReview:
                 index = 0
                 continue
             by_cost = sorted(pulled, key=trial.cost)
+            like = next((other for other, h in zip(others, pulled[-len(others) :], strict=True) if h is by_cost[0]), None)
+            if like is not None and (handed := self._handed_over(part, like, by_cost[0], parts)):
+                parts, index = handed, 0
+                continue
             chosen = distinct(stack_motions([h.motion for h in by_cost]), trial.box, 0.1, len(by_cost))
             parts[index] = replace(part, hypothesis=by_cost[0], rivals=tuple(by_cost[c] for c in chosen[1:]))
             index += 1
         return parts
+
+    def _handed_over(
+        self, part: MovingPart, like: MovingPart, best: Hypothesis, parts: list[MovingPart]
+    ) -> list[MovingPart] | None:
+        """The parts after one has given another what of it goes that other's way, and kept the rest; None if nothing does.
+
+        A tray may hold a corner of the door before it, and as a whole suit the door's way best.  Where that has been pulled
+        for the corner to fit, what moves along is told even if the door itself lies a little off.
+
+        Args:
+            part: that goes another's way best.
+            like: that other.
+            best: the way it goes.
+            parts: all of them.
+        """
+        if like.state != part.state or not self.touch(like, part):
+            return None
+        rest = [other for other in parts if other is not part and other is not like]
+        taker, giver = self.with_claims(replace(like, hypothesis=best), part, rest)
+        if giver is part or not giver.pieces:
+            return None
+        after = {id(part): giver, id(like): replace(taker, hypothesis=like.hypothesis)}
+        return [after.get(id(other), other) for other in parts]
 
     def _twin(
         self,
