@@ -12,7 +12,7 @@ from structuregs.boxes import Face, Overlap, Shown
 from structuregs.boxes.appearance import LOOK_DILATION
 from structuregs.capture import Capture, ImageStack, View
 from structuregs.fit.evidence import alike_in_both
-from structuregs.fit.laying import laid_anew
+from structuregs.fit.laying import BothStates, laid_anew
 from structuregs.geometry import SE3, Box, Camera
 from structuregs.joints import articulate
 from structuregs.model import SH_C0, ArticulatedObject, PosedParts, Splats
@@ -269,6 +269,33 @@ def test_a_plain_part_is_laid_by_what_shows_beside_it():
     laid = laid_anew(aside.parts, capture)
     corners = aside.parts.boxes.corners[1].double()
     torch.testing.assert_close(laid[1].apply(corners), slide(0.0).apply(corners), atol=0.005, rtol=0)
+
+
+@pytest.mark.parametrize(("slid", "to"), [(0.05, 0.0), (0.015, None)])
+def test_a_part_that_one_photo_shows_is_laid_where_those_of_both_states_say_if_that_is_elsewhere(slid, to):
+    """One photo of either state has no halves."""
+    whole = photographed(with_a_base(slide(0.0), PATCHES))
+    capture = replace(whole, train=(whole.train[0][3:4], whole.train[1][3:4]))
+    fitted = with_a_base(slide(slid), PATCHES).parts
+    both = BothStates(fitted, capture)
+    faces = [Face.most_shown(both.laid(1, state)) for state in (0, 1)]
+    assert [face.alike_at() for face in faces] == [None, None]
+    assert all(face.likeliest() is not None for face in faces)
+    laid = laid_anew(fitted, capture)
+    if to is None:
+        assert laid == {}
+    else:
+        corners = fitted.boxes.corners[1].double()
+        torch.testing.assert_close(laid[1].apply(corners), slide(to).apply(corners), atol=0.005, rtol=0)
+
+
+def test_a_part_stays_where_photos_of_the_two_states_find_it_likelier_in_two_places(monkeypatch):
+    capture = photographed(with_a_base(slide(0.0), PATCHES))
+    fitted = with_a_base(slide(0.05), PATCHES).parts
+    monkeypatch.setattr(Face, "alike_at", lambda _: None)
+    assert list(laid_anew(fitted, capture)) == [1]
+    monkeypatch.setattr(Face, "likeliest", lambda _: np.array([2.0, 0, 0]))  # the same place in either would be opposite
+    assert laid_anew(fitted, capture) == {}
 
 
 def test_a_fitted_part_stays_where_either_state_shows_something_else():

@@ -1,6 +1,8 @@
 """What photos of the two states show of a fitted part, laid upon each other."""
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 
 from ..boxes import Face, Overlap, Shown
 from ..capture import Capture, spread_cameras, stack_views
@@ -10,7 +12,8 @@ from .boxes import object_size
 
 _SIZE = 200  # side of a square with as many pixels as the photos that are laid upon each other
 _PHOTOS = 24  # of either state
-_EXACT = 1 / 64  # of the object's size: how exactly surfaces are known
+_EXACT = 1 / 64  # of the object's size, the unit: how exactly surfaces are known
+_ELSEWHERE = 1.0  # units: from so far away on a place that all photos of a state find likelier is another one
 
 
 class BothStates:
@@ -61,12 +64,31 @@ def laid_anew(parts: PosedParts, capture: Capture) -> dict[int, SE3]:
 
 
 def _laid(both: BothStates, k: int) -> SE3 | None:
-    """The motion of part k where photos of either state laid upon those of the other are alike, whichever are more so."""
-    laid = []
-    for state in (0, 1):
-        face = Face.most_shown(both.laid(k, state))
-        place = face.alike_at()
-        if place is not None:
-            motion = face.laid(place)
-            laid.append((face.unlike(place), motion.inverse() if state else motion))
-    return min(laid, key=lambda found: found[0])[1] if laid else None
+    """The motion of part k where photos of either state laid upon those of the other are alike, whichever are more so.
+
+    Where few photos see the part in both states, they cannot be asked by halves; then it is laid if all photos of either
+    state find it likelier elsewhere, and in one place.
+    """
+    faces = [Face.most_shown(both.laid(k, state)) for state in (0, 1)]
+    laid = [_at(face, face.alike_at(), state) for state, face in enumerate(faces)]
+    if laid == [None, None]:
+        laid = [_at(face, face.likeliest(), state, _ELSEWHERE) for state, face in enumerate(faces)]
+        if None in laid or _apart(faces[0].overlap.box, *(motion for _, motion in filter(None, laid))) > both.unit:
+            return None
+    return min(filter(None, laid), key=lambda found: found[0])[1]
+
+
+def _at(face: Face, place: Float64[np.ndarray, " 3"] | None, state: int, least: float = 0.0) -> tuple[float, SE3] | None:
+    """What photos of a state leave unexplained with a face at a place, and the motion from state 0 to 1 that lays it there.
+
+    None if there is no such place, or it is less than so many units away.
+    """
+    if place is None or np.linalg.norm(place) < least:
+        return None
+    motion = face.laid(place)
+    return face.unlike(place), motion.inverse() if state else motion
+
+
+def _apart(box: Box, one: SE3, other: SE3) -> float:
+    """How far two motions take a corner of a box apart at most, world units."""
+    return float((one.apply(box.corners) - other.apply(box.corners)).norm(dim=-1).max())
