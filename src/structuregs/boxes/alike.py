@@ -308,7 +308,8 @@ class Face:
     def likeliest(self) -> Float64[np.ndarray, " 3"] | None:
         """The place where all photos of the face together are most alike; None if they are not clearly less alike around it.
 
-        Not so sure as `alike_at`, which asks them by halves: enough to doubt where the face is, not to lay it elsewhere.
+        Not so sure as `alike_at`, which asks them by halves: one state's photos do to doubt where the face is, both states'
+        have to agree for it to be laid elsewhere.
         """
         if len(self.overlap) < _FEWEST:
             return None
