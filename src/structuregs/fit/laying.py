@@ -70,23 +70,28 @@ def _laid(both: BothStates, k: int) -> SE3 | None:
     state find it likelier elsewhere, and in one place.
     """
     faces = [Face.most_shown(both.laid(k, state)) for state in (0, 1)]
-    laid = [_at(face, face.alike_at(), state) for state, face in enumerate(faces)]
-    if laid == [None, None]:
-        laid = [_at(face, face.likeliest(), state, _ELSEWHERE) for state, face in enumerate(faces)]
-        if None in laid or _apart(faces[0].overlap.box, *(motion for _, motion in filter(None, laid))) > both.unit:
+    laid = _at(faces, [face.alike_at() for face in faces])
+    if not laid:
+        laid = _at(faces, [face.likeliest() for face in faces], _ELSEWHERE)
+        if len(laid) < 2 or _apart(faces[0].overlap.box, laid[0][1], laid[1][1]) > both.unit:
             return None
-    return min(filter(None, laid), key=lambda found: found[0])[1]
+    return min(laid, key=lambda found: found[0])[1]
 
 
-def _at(face: Face, place: Float64[np.ndarray, " 3"] | None, state: int, least: float = 0.0) -> tuple[float, SE3] | None:
-    """What photos of a state leave unexplained with a face at a place, and the motion from state 0 to 1 that lays it there.
+def _at(faces: list[Face], places: list[Float64[np.ndarray, " 3"] | None], least: float = 0.0) -> list[tuple[float, SE3]]:
+    """What photos leave unexplained with a face at its place, and the motion from state 0 to 1 that lays it there.
 
-    None if there is no such place, or it is less than so many units away.
+    Args:
+        faces: of a part, as photos of state 0 and of state 1 show it.
+        places: of either face, or None.
+        least: units; a place that is less far away counts as none.
     """
-    if place is None or np.linalg.norm(place) < least:
-        return None
-    motion = face.laid(place)
-    return face.unlike(place), motion.inverse() if state else motion
+    laid = []
+    for state, (face, place) in enumerate(zip(faces, places, strict=True)):
+        if place is not None and np.linalg.norm(place) >= least:
+            motion = face.laid(place)
+            laid.append((face.unlike(place), motion.inverse() if state else motion))
+    return laid
 
 
 def _apart(box: Box, one: SE3, other: SE3) -> float:
