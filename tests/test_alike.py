@@ -271,6 +271,16 @@ def test_a_plain_part_is_laid_by_what_shows_beside_it():
     torch.testing.assert_close(laid[1].apply(corners), slide(0.0).apply(corners), atol=0.005, rtol=0)
 
 
+def test_what_one_state_finds_hardly_beside_a_part_is_believed_if_the_other_does_not_contradict(monkeypatch):
+    capture = photographed(with_a_base(slide(0.0), PATCHES))
+    near, right = (with_a_base(slide(aside), PATCHES).parts for aside in (0.01, 0.0))
+    assert list(laid_anew(near, capture)) == [1]
+    monkeypatch.setattr(Face, "alike_at", lambda face: np.array([0.4, 0, 0]) if face.overlap.motion.xyz[2] > 0 else None)
+    assert laid_anew(right, capture) == {}
+    monkeypatch.setattr(Face, "alike_at", lambda face: np.array([1.5, 0, 0]) if face.overlap.motion.xyz[2] > 0 else None)
+    assert list(laid_anew(right, capture)) == [1]
+
+
 @pytest.mark.parametrize(("slid", "to"), [(0.05, 0.0), (0.015, None)])
 def test_a_part_that_one_photo_shows_is_laid_where_those_of_both_states_say_if_that_is_elsewhere(slid, to):
     """One photo of either state has no halves."""

@@ -66,16 +66,26 @@ def laid_anew(parts: PosedParts, capture: Capture) -> dict[int, SE3]:
 def _laid(both: BothStates, k: int) -> SE3 | None:
     """The motion of part k where photos of either state laid upon those of the other are alike, whichever are more so.
 
+    Less than a unit away it is laid only if photos of neither state are less alike there: so near, those of one state may err.
     Where few photos see the part in both states, they cannot be asked by halves; then it is laid if all photos of either
     state find it likelier elsewhere, and in one place.
     """
     faces = [Face.most_shown(both.laid(k, state)) for state in (0, 1)]
+    box, now = faces[0].overlap.box, faces[0].overlap.motion
     laid = _at(faces, [face.alike_at() for face in faces])
     if not laid:
         laid = _at(faces, [face.likeliest() for face in faces], _ELSEWHERE)
-        if len(laid) < 2 or _apart(faces[0].overlap.box, laid[0][1], laid[1][1]) > both.unit:
+        if len(laid) < 2 or _apart(box, laid[0][1], laid[1][1]) > both.unit:
             return None
-    return min(laid, key=lambda found: found[0])[1]
+    motion = min(laid, key=lambda found: found[0])[1]
+    return motion if _apart(box, motion, now) > both.unit or _suits_both(faces, motion) else None
+
+
+def _suits_both(faces: list[Face], motion: SE3) -> bool:
+    """Whether photos of neither state are less alike with a motion than where their faces were found."""
+    to_other = (motion, motion.inverse())
+    further = [(way @ face.overlap.motion.inverse()).as_matrix().numpy() for face, way in zip(faces, to_other, strict=True)]
+    return all(face.overlap.unlike(by) <= face.overlap.unlike() for face, by in zip(faces, further, strict=True))
 
 
 def _at(faces: list[Face], places: list[Float64[np.ndarray, " 3"] | None], least: float = 0.0) -> list[tuple[float, SE3]]:
