@@ -906,6 +906,28 @@ class TestReview:
                 assert len(whole.points) == len(right.points)
                 torch.testing.assert_close(whole.hypothesis.motion.as_matrix(), right.hypothesis.motion.as_matrix())
 
+    def test_what_either_state_shows_of_one_part_is_one(self):
+        """The half of the screen, found in the one state; found in the other, it goes where that state shows the other half."""
+        review, right, _ = self.found()
+        left = right.points[:, 0] < 0
+        aside = Screw("prismatic", torch.tensor([1.0, 0, 0], dtype=F64), torch.zeros(3, dtype=F64))
+        beside = aside.motion(float(right.points[:, 0].max())) @ right.hypothesis.motion.inverse()
+        leader = replace(right, pieces=(right.points[left],))
+        follower = replace(
+            right,
+            state=1 - right.state,
+            pieces=(leader.points_in(1 - right.state),),
+            hypothesis=replace(right.hypothesis, motion=beside),
+            weight=0.4 * right.weight,
+        )
+        (whole,) = review.joined([leader, follower])
+        assert len(whole.points) > 0.95 * len(right.points)
+        torch.testing.assert_close(whole.hypothesis.motion.as_matrix(), right.hypothesis.motion.as_matrix())
+        upon = replace(follower, hypothesis=replace(right.hypothesis, motion=right.hypothesis.motion.inverse()))
+        assert review.joined([leader, upon]) == [leader, upon], "nothing but the leader lies there"
+        heavier = replace(follower, weight=0.9 * right.weight)
+        assert review.joined([leader, heavier]) == [leader, heavier], "it shows less there"
+
     def test_parts_side_by_side_that_move_differently_stay_two(self):
         review, parts = true_parts_of("cabinet")
         assert len(parts) == 2

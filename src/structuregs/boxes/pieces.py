@@ -118,16 +118,20 @@ class Pieces:
     def take(self, cluster: Cluster) -> None:
         """Takes a cluster among those to explain, if the photos of its own state show it, and need it where they do."""
         look = self.looks[cluster.state]
-        splats = look.splats
         held = self.held_by(cluster.points, cluster.state)
-        scene, piece = self.scene(cluster.state, splats[~held]), splats[held]
-        weight = scene.absent - scene.error(piece, SE3.identity(dtype=torch.float64))
-        footprint, share = scene.footprint(piece), len(cluster.points) / len(look.points)
+        weight, footprint = self.needed(held, cluster.state)
+        share = len(cluster.points) / len(look.points)
         if footprint > self.config.painted * share and weight > self.config.there * footprint:
             self.clusters.append(cluster)
             self.boxes.append(self.box(cluster.points))
             self.held.append(held)
             self.weights.append(weight)
+
+    def needed(self, held: Bool[Tensor, " N"], state: int) -> tuple[float, float]:
+        """What the photos of a state lose without some of its splats, in mean error, and the share of them that these cover."""
+        splats = self.looks[state].splats
+        scene, piece = self.scene(state, splats[~held]), splats[held]
+        return scene.absent - scene.error(piece, SE3.identity(dtype=torch.float64)), scene.footprint(piece)
 
     def box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
         """The box around points."""

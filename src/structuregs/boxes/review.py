@@ -12,7 +12,7 @@ from torch import Tensor
 from ..geometry import SE3, screw_at
 from ..joints import kind_of
 from .alike import Face, Overlap, Shown
-from .cue import linked, one_box_holds
+from .cue import Points, linked, one_box_holds
 from .divide import AROUND, moving_along
 from .hypotheses import Hypothesis, displacements, distinct, flips, stack_motions
 from .judge import Trial
@@ -123,34 +123,52 @@ class PartReview:
         weight = sum(pieces.weights[i] for i in there)
         if weight < self.config.as_clear * part.weight:
             return part
-        back = [replace(h, motion=h.motion.inverse()) for h in (part.hypothesis, *part.rivals)]
-        return replace(part, state=other, pieces=points, hypothesis=back[0], rivals=tuple(back[1:]), weight=weight)
+        return replace(_found_in_the_other(part, points), weight=weight)
 
     def joined(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, those side by side in one state made one that as one explain the photos better, or moving alike as well.
 
         A door and what stands before it may be found as two.  They are asked before either is pulled into place: each
-        would be pulled over what the other leaves unexplained, and what is thin hardly says how it moves.
+        would be pulled over what the other leaves unexplained, and what is thin hardly says how it moves.  So may one thing
+        be that either state shows, such as a handle pulled out and what of it is seen when it is pushed in.
         """
         parts, beside = list(parts), self.config.cue.link + self.config.clear
         while True:
-            ways = [
-                (*self._as_one(one, two, [part for part in parts if part is not one and part is not two]), (one, two))
-                for one, two in itertools.combinations(parts, 2)
-                if one.state == two.state and self._voxels_between(one, two) <= beside
-            ]
+            ways = []
+            for one, two in itertools.combinations(parts, 2):
+                follower, leader = sorted((one, two), key=lambda part: part.weight)
+                if follower.state != leader.state:
+                    follower = self._as_shown_beside(leader, follower)
+                if self._voxels_between(follower, leader) <= beside:
+                    rest = [part for part in parts if part is not one and part is not two]
+                    ways.append((*self._as_one(leader, follower, rest), (one, two)))
             harm, whole, pair = min(ways, key=lambda way: way[0], default=(1.0, None, ()))
             if whole is None or harm > 0:
                 return parts
             parts = [whole, *(part for part in parts if all(part is not one for one in pair))]
 
-    def _as_one(self, one: MovingPart, two: MovingPart, rest: list[MovingPart]) -> tuple[float, MovingPart]:
+    def _as_shown_beside(self, leader: MovingPart, follower: MovingPart) -> MovingPart:
+        """A part of the other state, which lies there where the leader goes, as what the leader's state shows of it.
+
+        That is what lies where it goes and is not the leader's; nothing if it does not lie there, or shows less well.
+        """
+        places = [np.zeros((0, 3))]
+        if float(self._lying_in(leader, follower).double().mean()) > 0.6:
+            clusters = [cluster for cluster in self.pieces.clusters if cluster.state == leader.state]
+            places += [cluster.points[self.pieces.within(follower, cluster).numpy()] for cluster in clusters]
+        points = np.unique(np.concatenate(places), axis=0)
+        points = points[KDTree(leader.points).query(points)[0] > 0] if len(points) else points
+        if not len(points):
+            return _found_in_the_other(follower, ())
+        weight, _ = self.pieces.needed(self.pieces.held_by(points, leader.state), leader.state)
+        return _found_in_the_other(follower, (points,) if weight >= self.config.as_clear * follower.weight else ())
+
+    def _as_one(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> tuple[float, MovingPart]:
         """What speaks against two parts of one state being one, in mean error (below 0: nothing), and the two as one.
 
         Of the two, whichever is to move like the other has to show where that brings it, or the lesser has to continue the
         greater: wherever it goes unseen, as a tray does behind a door, it would do no harm.
         """
-        follower, leader = sorted((one, two), key=lambda part: part.weight)
         (whole,) = self._merged(leader, follower, [])
         trial, box = self._again(whole, rest), self.pieces.box
         own, other = (trial.judge(h) for h in (leader.hypothesis, trial.moved(leader.hypothesis, follower.hypothesis.motion)))
@@ -363,3 +381,9 @@ class PartReview:
         trial = self.pieces.trial(part.state, part.points, self.pieces.splats_of(part), part.weight, others)
         taken = [other.points_in(1 - part.state) for other in others]
         return replace(trial, taken=KDTree(np.concatenate([self.pieces.stays.data, *taken])))
+
+
+def _found_in_the_other(part: MovingPart, points: tuple[Points, ...]) -> MovingPart:
+    """A part as found in the other state, where it has these points."""
+    back = [replace(h, motion=h.motion.inverse()) for h in (part.hypothesis, *part.rivals)]
+    return replace(part, state=1 - part.state, pieces=points, hypothesis=back[0], rivals=tuple(back[1:]))
