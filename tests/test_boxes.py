@@ -859,6 +859,35 @@ class TestParts:
             assert min(errors(part.motion, part.points_in(0), true)[0] for part in parts) < 4
 
 
+class TestPartsThatMayBeOne:
+    """Those that touch, and that the other state does not show."""
+
+    @pytest.mark.parametrize("shows", [False, True])
+    def test_a_part_cut_in_two_whose_pieces_go_astray_is_tried_as_one(self, shows: bool, monkeypatch: pytest.MonkeyPatch):
+        search, (right,) = PartSearch(looks_of("laptop")[1], SMALL.search, seed=0), parts_of("laptop")
+        monkeypatch.setattr(search.review, "shows", lambda *_: shows)
+        left, astray = right.points[:, 0] < 0, SE3.exp(torch.tensor([0, 0, 0.5, 0, 0.6, 0], dtype=F64))
+        ways = [right.hypothesis.motion @ astray, right.hypothesis.motion @ astray.inverse()]
+        halves = [
+            replace(right, pieces=(right.points[side],), hypothesis=replace(right.hypothesis, motion=motion))
+            for side, motion in zip((left, ~left), ways, strict=True)
+        ]
+        found = search._whole_again(halves)
+        if shows:
+            assert found == halves
+        else:
+            (whole,) = found
+            assert len(whole.points) == len(right.points)
+            moved, truly = whole.points_in(1 - whole.state), right.points_in(1 - right.state)
+            assert np.abs(np.sort(moved, 0) - np.sort(truly, 0)).max() < 0.05
+
+    def test_two_parts_stay_two(self, monkeypatch: pytest.MonkeyPatch):
+        search, (_, parts) = PartSearch(looks_of("cabinet")[1], SMALL.search, seed=0), true_parts_of("cabinet")
+        monkeypatch.setattr(search.review, "shows", lambda *_: False)
+        monkeypatch.setattr(search.review, "touch", lambda *_: True)
+        assert search._whole_again(parts) == parts
+
+
 class TestReview:
     """The laptop's screen, found rightly and wrongly."""
 

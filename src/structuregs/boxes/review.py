@@ -81,7 +81,7 @@ class PartReview:
         pieces, state = self.pieces, taker.state
         held, mine = pieces.held_by_part(giver), pieces.looks[state].splats
         splats = mine[held]
-        if not len(splats) or not self._shows(taker, others):  # crumbs; or none can say what moves along
+        if not len(splats) or not self.shows(taker, others):  # crumbs; or none can say what moves along
             return taker, giver
         screw, q = screw_at(taker.hypothesis.motion, kind_of(taker.hypothesis.motion), pieces.box(taker.points).T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(AROUND, dtype=torch.float64)).wxyz_xyz
@@ -301,7 +301,7 @@ class PartReview:
         apart = gaps * float(self.pieces.box(part.points).half_extents.norm()) / self.pieces.voxel
         return agree | (lesser & (voxels <= self.config.cue.link + self.config.clear) & (apart < _BLURRED))
 
-    def _shows(self, part: MovingPart, others: list[MovingPart]) -> bool:
+    def shows(self, part: MovingPart, others: list[MovingPart]) -> bool:
         """Whether the photos of the other state show a part, with others in place."""
         trial = self._again(part, others)
         return trial.shows(trial.judge(part.hypothesis))
