@@ -92,6 +92,10 @@ class Scene:
         """`absent`, or `absent_quick`."""
         return self.absent_quick if quick else self.absent
 
+    def needs(self, part: Splats) -> float:
+        """What the photos lose without a part where it is, in mean error."""
+        return self.absent - self.error(part, SE3.identity(dtype=torch.float64))
+
     @torch.no_grad()
     def footprint(self, part: Splats) -> float:
         """Mean share of the judging photos that the part paints where it is."""

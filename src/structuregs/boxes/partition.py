@@ -132,13 +132,12 @@ class PartSearch:
 
     def _tried_as_one(self, one: MovingPart, two: MovingPart, rest: list[MovingPart]) -> MovingPart | None:
         """Two parts as one, with the motion that photos like best; None if they like the two better."""
-        done = set(range(len(self.pieces)))
-        open_ = done.difference(*(self.pieces.explained_by(part) for part in rest))
+        same_state = {i for i, cluster in enumerate(self.pieces.clusters) if cluster.state == one.state}
+        done = same_state.union(*(self.pieces.explained_by(part) for part in rest))
         new = self._taken(one.state, [np.concatenate([one.points, two.points])])
         if not new:
             return None
-        arrivals = {i for i in open_ if self.pieces.clusters[i].state != one.state}
-        whole, _, trial = self._try(new[0], rest, done - arrivals, None)
+        whole, _, trial = self._try(new[0], rest, done, None)
         box, splats_of = self.pieces.box, self.pieces.splats_of
         apart = trial.apart((splats_of(part), box(part.points), part.hypothesis.motion) for part in (one, two))
         return whole if whole.hypothesis.error < apart else None

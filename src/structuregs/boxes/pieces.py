@@ -119,19 +119,18 @@ class Pieces:
         """Takes a cluster among those to explain, if the photos of its own state show it, and need it where they do."""
         look = self.looks[cluster.state]
         held = self.held_by(cluster.points, cluster.state)
-        weight, footprint = self.needed(held, cluster.state)
-        share = len(cluster.points) / len(look.points)
+        scene, piece = self.parted(held, cluster.state)
+        weight, footprint, share = scene.needs(piece), scene.footprint(piece), len(cluster.points) / len(look.points)
         if footprint > self.config.painted * share and weight > self.config.there * footprint:
             self.clusters.append(cluster)
             self.boxes.append(self.box(cluster.points))
             self.held.append(held)
             self.weights.append(weight)
 
-    def needed(self, held: Bool[Tensor, " N"], state: int) -> tuple[float, float]:
-        """What the photos of a state lose without some of its splats, in mean error, and the share of them that these cover."""
+    def parted(self, held: Bool[Tensor, " N"], state: int) -> tuple[Scene, Splats]:
+        """A state's photos as judges of some of its splats among all its others, and those splats."""
         splats = self.looks[state].splats
-        scene, piece = self.scene(state, splats[~held]), splats[held]
-        return scene.absent - scene.error(piece, SE3.identity(dtype=torch.float64)), scene.footprint(piece)
+        return self.scene(state, splats[~held]), splats[held]
 
     def box(self, points: Float64[np.ndarray, "P 3"]) -> Box:
         """The box around points."""

@@ -79,14 +79,12 @@ class PartReview:
             others: other parts in their places.
         """
         pieces, state = self.pieces, taker.state
-        held, mine = pieces.held_by_part(giver), pieces.looks[state].splats
-        splats = mine[held]
+        here, splats = pieces.parted(pieces.held_by_part(giver), state)
         if not len(splats) or not self.shows(taker, others):  # crumbs; or none can say what moves along
             return taker, giver
         screw, q = screw_at(taker.hypothesis.motion, kind_of(taker.hypothesis.motion), pieces.box(taker.points).T_world_box.xyz)
         motions = screw.motion(q * torch.tensor(AROUND, dtype=torch.float64)).wxyz_xyz
         there = pieces.scene(1 - state, pieces.rest([*others, taker], state))
-        here = pieces.scene(state, mine[~held])
         support = there.support(splats, SE3(torch.cat([motions, giver.hypothesis.motion.wxyz_xyz[None]])))
         needed = here.support(splats, SE3.identity(1, dtype=torch.float64))[0]
         means = splats.means.double().numpy()
@@ -160,8 +158,9 @@ class PartReview:
         points = points[KDTree(leader.points).query(points)[0] > 0] if len(points) else points
         if not len(points):
             return _found_in_the_other(follower, ())
-        weight, _ = self.pieces.needed(self.pieces.held_by(points, leader.state), leader.state)
-        return _found_in_the_other(follower, (points,) if weight >= self.config.as_clear * follower.weight else ())
+        scene, piece = self.pieces.parted(self.pieces.held_by(points, leader.state), leader.state)
+        clear = scene.needs(piece) >= self.config.as_clear * follower.weight
+        return _found_in_the_other(follower, (points,) if clear else ())
 
     def _as_one(self, leader: MovingPart, follower: MovingPart, rest: list[MovingPart]) -> tuple[float, MovingPart]:
         """What speaks against two parts of one state being one, in mean error (below 0: nothing), and the two as one.
