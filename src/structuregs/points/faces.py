@@ -11,7 +11,7 @@ _TURNS = np.arange(-12.0, 12.1, 3.0)  # degrees about each axis, at first
 _STARTS = 4  # of the turns at first, the best...
 _CLOSE = 4.5  # ...that are so many degrees apart, from which...
 _STEPS = (1.5, 0.8, 0.4, 0.2, 0.1, 0.05)  # ...turns of so many degrees climb
-_SHARPER = 1.03  # times: less is chance, or as good as it was
+_SHARPER = 0.03  # more, of so many points: less is chance, or as good as it was
 _FRAME = 1.0  # degrees: the world's axes stand for those that are this near and not clearly sharper
 
 Axes = Float64[np.ndarray, "3 3"]
@@ -40,11 +40,12 @@ def face_axes(points: Float64[np.ndarray, "P 3"], start: Axes, cell: float) -> A
             starts.append(axes)
     sharpness, best = max((_climbed(points, axes, cell) for axes in starts), key=lambda found: found[0])
     as_given = _sharpness(points, start, cell)
-    if sharpness <= _SHARPER * as_given:
+    clearly = 1 + _SHARPER * np.sqrt(_MOST / len(points))  # shares scatter the more, the fewer points they are of
+    if sharpness <= clearly * as_given:
         sharpness, best = as_given, start
     world = np.round(best)  # signed axes of the world, if the best are near any; at 45 degrees it is no rotation
     near = np.abs(world).sum() == 3 and _apart(best, world) < _FRAME
-    return world if near and sharpness <= _SHARPER * _sharpness(points, world, cell) else best
+    return world if near and sharpness <= clearly * _sharpness(points, world, cell) else best
 
 
 def _climbed(points: Float64[np.ndarray, "P 3"], axes: Axes, cell: float) -> tuple[float, Axes]:
