@@ -268,10 +268,12 @@ class PartReview:
         shows = trial.shows(judged[0])
         alike = (gaps < self.config.same) & (losses < self.config.alike * part.weight)
         alike &= (shows & lesser) | touching | self._agree(part, others, gaps, shows)
-        # A piece that continues a weightier part, or shows, and has no better motion of its own than that belongs to it.
+        # A piece that continues a weightier part, or shows, and has no better motion of its own than that belongs to it; so
+        # does one on the other side of the hinge, that is in one piece with that part where both hardly move.
         best_of_its_own = min(map(trial.burden, pulled[:own]))
         needless = np.array([h.error + trial.gone_in(h) for h in as_they_move]) < best_of_its_own
-        alike |= needless & (touching | shows) & lesser
+        told = np.array([trial.explained(h) > part.weight for h in as_they_move])
+        alike |= needless & (touching | shows | told) & lesser
         little = _NO_SCRAP * part.weight
         if not shows and trial.explained(best) < little:  # nor has one that explains little, and loses little
             alike |= (losses < little) & touching & lesser
