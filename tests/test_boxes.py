@@ -957,6 +957,22 @@ class TestReview:
         heavier = replace(follower, weight=0.9 * right.weight)
         assert review.joined([leader, heavier]) == [leader, heavier], "it shows less there"
 
+    @pytest.mark.parametrize(("weight", "count"), [(0.1, 1), (10.0, 2)])
+    def test_a_piece_beyond_the_hinge_goes_with_its_part_if_photos_tell_so(
+        self, weight: float, count: int, monkeypatch: pytest.MonkeyPatch
+    ):
+        """It touches none, and little of it shows in the other state: what it explains of both states' photos tells."""
+        review, right, wrong = self.found()
+        one, other = (right.points[side] for side in (right.points[:, 0] < 0, right.points[:, 0] > 0.4))
+        large = replace(right, pieces=(one,), weight=20 * right.weight)
+        small = replace(wrong, pieces=(other,), weight=weight * right.weight)
+        monkeypatch.setattr(Trial, "shows", lambda *_: False)
+        assert not review.touch(large, small)
+        kept = review._reconsider([large, small])
+        assert len(kept) == count
+        same = right.hypothesis.motion.as_matrix()
+        torch.testing.assert_close(kept[0].hypothesis.motion.as_matrix(), same, atol=0.05, rtol=0)
+
     def test_parts_side_by_side_that_move_differently_stay_two(self):
         review, parts = true_parts_of("cabinet")
         assert len(parts) == 2
@@ -1251,7 +1267,7 @@ class TestBoxesOfParts:
     @pytest.mark.parametrize("name", ["laptop", "drawer"])
     def test_hold_the_parts_in_state_0(self, name: str):
         obj, looks = looks_of(name)
-        boxes, motions = boxes_of_parts(looks, parts_of(name), SMALL)
+        boxes, motions = boxes_of_parts(search_of(name)[0].pieces, parts_of(name), SMALL)
         assert boxes.half_extents.shape == (2, 3)
         assert motions.wxyz_xyz[0].tolist() == [1, 0, 0, 0, 0, 0, 0]
         assert boxes.half_extents.dtype == motions.wxyz_xyz.dtype == torch.float32
@@ -1262,7 +1278,9 @@ class TestBoxesOfParts:
         assert boxes[0].contains(still, margin=2 * voxel).all()
 
     @pytest.mark.parametrize(("gap", "left_out"), [(0.2, True), (0.4, False)])
-    def test_the_base_s_box_need_not_hold_what_is_beside_a_hinge(self, gap: float, left_out: bool):
+    def test_the_base_s_box_need_not_hold_what_is_beside_a_hinge(
+        self, gap: float, left_out: bool, monkeypatch: pytest.MonkeyPatch
+    ):
         """A door from x = 0 to 1, its hinge and the base from x = -gap on; between the two what both hulls hold."""
         g = np.random.default_rng(0)
         base, strip, door = (
@@ -1275,25 +1293,55 @@ class TestBoxesOfParts:
             looks.append(replace(look, hull=hull, points=np.concatenate([base, strip])))
         hinge = Screw("revolute", torch.tensor([0.0, 0, 1]).double(), torch.tensor([-gap, 0.0, 0]).double())
         found = MovingPart(0, (door,), Hypothesis(hinge.motion(1.0), 0.0, 0.0, 0.0), 0.5, 0.1)
-        boxes, _ = boxes_of_parts((looks[0], looks[1]), [found], SMALL)
+        pieces = Pieces((looks[0], looks[1]), SMALL.search, seed=0)
+        monkeypatch.setattr(pieces, "is_surface", lambda *_: False)
+        boxes, _ = boxes_of_parts(pieces, [found], SMALL)
         by = SMALL.margin * 0.1
         assert float(boxes[0].corners[:, 0].max()) == pytest.approx((-gap if left_out else 0.0) + by, abs=0.08)
         assert float(boxes[1].corners[:, 0].min()) == pytest.approx(-by, abs=0.05), "the door's own box stays as it is"
 
+    @pytest.mark.parametrize("surface", [True, False])
+    def test_what_a_part_covers_in_one_state_alone_is_the_base_s_if_it_is_a_surface(
+        self, surface: bool, monkeypatch: pytest.MonkeyPatch
+    ):
+        """Two blades, one upon the other in state 0, a quarter of a turn about z apart in state 1."""
+        g = np.random.default_rng(0)
+        grip, below, upon = (
+            g.uniform([low, -0.1, z], [high, 0.1, z + 0.1], (3000, 3)) for low, high, z in ((-1, 0, 0), (0.3, 2, 0), (0, 2, 0))
+        )
+        looks = []
+        for look in looks_of("laptop")[1]:
+            hull = replace(look.hull, occupied=np.ones((60, 60, 60), bool), origin=np.full(3, -3.0), voxel=0.1)
+            looks.append(replace(look, hull=hull, points=np.concatenate([grip, below])))
+        pin = Screw("revolute", torch.tensor([0.0, 0, 1]).double(), torch.zeros(3).double())
+        found = MovingPart(0, (upon,), Hypothesis(pin.motion(0.5 * math.pi), 0.0, 0.0, 0.0), 0.5, 0.1)
+        pieces = Pieces((looks[0], looks[1]), SMALL.search, seed=0)
+        monkeypatch.setattr(pieces, "is_surface", lambda _, state: surface and state == 1)
+        boxes, _ = boxes_of_parts(pieces, [found], SMALL)
+        by = SMALL.margin * 0.1
+        reach = float(boxes[0].corners[:, 0].max())
+        assert reach == pytest.approx(2.0 + by, abs=0.05) if surface else reach < 0.3
+
+    def test_what_hangs_in_the_air_is_no_surface(self):
+        pieces, (screen,) = search_of("laptop")[0].pieces, parts_of("laptop")
+        assert pieces.is_surface(screen.points, screen.state)
+        assert not pieces.is_surface(screen.points + 5.0, screen.state)
+
     def test_what_few_masks_leave_in_the_air_is_not_the_base_s(self):
         _, looks = looks_of("laptop")
-        clean = boxes_of_parts(looks, parts_of("laptop"), SMALL)[0]
+        clean = boxes_of_parts(search_of("laptop")[0].pieces, parts_of("laptop"), SMALL)[0]
         haunted = []
         for look in looks:
             occupied = look.hull.occupied.copy()
             occupied[:6, :6, -6:] = True  # a corner of the grid, far from the laptop
             haunted.append(replace(look, hull=replace(look.hull, occupied=occupied)))
-        found = boxes_of_parts((haunted[0], haunted[1]), parts_of("laptop"), SMALL)[0]
+        pieces = Pieces((haunted[0], haunted[1]), SMALL.search, seed=0)
+        found = boxes_of_parts(pieces, parts_of("laptop"), SMALL)[0]
         torch.testing.assert_close(found.half_extents, clean.half_extents)
 
     def test_splats_on_trial_are_strewn_evenly_in_and_around_them(self):
         """What sticks out of a box by less than the reach, such as a handle, has some near it: half extents grow by it."""
-        boxes = boxes_of_parts(looks_of("laptop")[1], parts_of("laptop"), SMALL)[0]
+        boxes = boxes_of_parts(search_of("laptop")[0].pieces, parts_of("laptop"), SMALL)[0]
         generator = torch.Generator().manual_seed(0)
         faint = strewn(boxes, SE3.identity(2), 4000, 0, generator, torch.ones(3), reach=0.2).splats
         local = faint.means.reshape(2, -1, 3) * boxes.half_extents[:, None]

@@ -117,15 +117,24 @@ class Pieces:
 
     def take(self, cluster: Cluster) -> None:
         """Takes a cluster among those to explain, if the photos of its own state show it, and need it where they do."""
-        look = self.looks[cluster.state]
         held = self.held_by(cluster.points, cluster.state)
-        scene, piece = self.parted(held, cluster.state)
-        weight, footprint, share = scene.needs(piece), scene.footprint(piece), len(cluster.points) / len(look.points)
-        if footprint > self.config.painted * share and weight > self.config.there * footprint:
+        weight = self._weight(cluster.points, held, cluster.state)
+        if weight is not None:
             self.clusters.append(cluster)
             self.boxes.append(self.box(cluster.points))
             self.held.append(held)
             self.weights.append(weight)
+
+    def is_surface(self, points: Points, state: int) -> bool:
+        """Whether points are of a surface, not in the air: the photos of their state show it, and need it where they do."""
+        return self._weight(points, self.held_by(points, state), state) is not None
+
+    def _weight(self, points: Points, held: Bool[Tensor, " N"], state: int) -> float | None:
+        """What the photos of a state lose without the splats that some points hold, in mean error; None if in the air."""
+        scene, piece = self.parted(held, state)
+        weight, footprint, share = scene.needs(piece), scene.footprint(piece), len(points) / len(self.looks[state].points)
+        shown = footprint > self.config.painted * share and weight > self.config.there * footprint
+        return weight if shown else None
 
     def parted(self, held: Bool[Tensor, " N"], state: int) -> tuple[Scene, Splats]:
         """A state's photos as judges of some of its splats among all its others, and those splats."""

@@ -14,9 +14,9 @@ from ..joints import kind_of
 from ..points import Clouds, Silhouettes, object_bounds
 from .appearance import AppearanceConfig, fit_state, surface_points
 from .config import SearchConfig
-from .cue import StateLook, base_axes, box_around, clusters, held_by_hull
+from .cue import Points, StateLook, base_axes, box_around, clusters, held_by_hull, linked
 from .partition import PartSearch
-from .pieces import MovingPart
+from .pieces import MovingPart, Pieces
 
 _HINGE = 0.5  # of a box's half extents: a hinge so far outside the box may still be its part's
 
@@ -68,14 +68,22 @@ def _grown(points: Float64[np.ndarray, "P 3"], by: float, axes: Float64[Tensor, 
     return Box(box.T_world_box, box.half_extents + by)
 
 
-def boxes_of_parts(looks: tuple[StateLook, StateLook], parts: list[MovingPart], config: StartConfig) -> tuple[Box, SE3]:
-    """Boxes in state 0 and motions (K of each, float32, the base first) of the parts that a search found."""
-    by = config.margin * looks[0].hull.voxel
+def boxes_of_parts(pieces: Pieces, parts: list[MovingPart], config: StartConfig) -> tuple[Box, SE3]:
+    """Boxes in state 0 and motions (K of each, float32, the base first) of the parts that a search found.
+
+    Args:
+        pieces: that it worked with.
+        parts: that it found.
+        config: of the start.
+    """
+    looks, by = pieces.looks, config.margin * pieces.voxel
     moving = [_grown(part.points_in(0), by) for part in parts]
     drawn = [_to_hinge(box, part.motion) for box, part in zip(moving, parts, strict=True)]
     posed = [(box, box.moved(part.motion)) for box, part in zip(drawn, parts, strict=True)]
-    still = _grown(_still_points(looks, posed), by, base_axes(looks))
-    return _stacked([still, *moving], [SE3.identity(dtype=torch.float64), *(part.motion for part in parts)])
+    still, axes = _still_points(looks, posed), base_axes(looks)
+    uncovered = _uncovered(pieces, _grown(still, by, axes), posed)
+    base = _grown(np.concatenate([still, *uncovered]), by, axes)
+    return _stacked([base, *moving], [SE3.identity(dtype=torch.float64), *(part.motion for part in parts)])
 
 
 def _to_hinge(box: Box, motion: SE3) -> Box:
@@ -108,6 +116,29 @@ def _still_points(looks: tuple[StateLook, StateLook], moving: list[tuple[Box, Bo
         rows.append(look.points[still.numpy()])
     hull = looks[0].hull
     return np.concatenate(rows) if any(map(len, rows)) else hull.centres(hull.occupied & looks[1].hull.occupied)
+
+
+def _uncovered(pieces: Pieces, base: Box, moving: list[tuple[Box, Box]]) -> list[Points]:
+    """Surfaces of the base beyond its box that moving parts cover in one state and leave free in the other.
+
+    Two blades may lie one upon the other when they are shut.  Few views leave points in the air where a part has been; these
+    are no surfaces.
+
+    Args:
+        pieces: that the search worked with.
+        base: the box of what stands still and lies in no moving box.
+        moving: the moving boxes, as they lie in either state.
+    """
+    looks = pieces.looks
+    found = []
+    for state, (look, other) in enumerate((looks, looks[::-1])):
+        points = torch.from_numpy(look.points)
+        free = torch.from_numpy(held_by_hull(look.points, other)) & ~base.contains(points)
+        for boxes in moving:
+            free &= ~boxes[state].contains(points)
+        some = linked(look.points[free.numpy()], pieces.config.cue, pieces.voxel)
+        found += [piece for piece in some if pieces.is_surface(piece, state)]
+    return found
 
 
 def boxes_at_rest(looks: tuple[StateLook, StateLook], count: int | None, config: StartConfig) -> tuple[Box, SE3]:

@@ -66,7 +66,7 @@ def start_parts(
                 f"{share:.0%} of what state {state} shows is in no part: no one motion puts it where state {1 - state} has it",
                 lasting=True,
             )
-        boxes, motions = boxes_of_parts(pair, found, config.start)
+        boxes, motions = boxes_of_parts(search.pieces, found, config.start)
         posed = seeded(boxes, motions, pair, found, *filling, config.growth.reach * object_size(boxes))
     else:
         boxes, motions = boxes_at_rest(pair, parts, config.start)
