@@ -1265,6 +1265,19 @@ class TestMovingAlong:
         assert not self.belongs(1.0, door=(-6, 0))[0].any()
 
 
+def pieces_in_full_hulls(points: np.ndarray) -> Pieces:
+    """Of two states that show the same points, in hulls that hold everything within 3 units; voxels are .1 units."""
+    first, second = (
+        replace(
+            look,
+            points=points,
+            hull=replace(look.hull, occupied=np.ones((60, 60, 60), bool), origin=np.full(3, -3.0), voxel=0.1),
+        )
+        for look in looks_of("laptop")[1]
+    )
+    return Pieces((first, second), SMALL.search, seed=0)
+
+
 class TestBoxesOfParts:
     @pytest.mark.parametrize("name", ["laptop", "drawer"])
     def test_hold_the_parts_in_state_0(self, name: str):
@@ -1289,13 +1302,9 @@ class TestBoxesOfParts:
             g.uniform([low, -0.02 - deep, 0], [high, 0.02, 0.8], (2000, 3))
             for low, high, deep in ((-2 - gap, -gap, 0.7), (-gap, 0, 0), (0, 1, 0))
         )
-        looks = []
-        for look in looks_of("laptop")[1]:
-            hull = replace(look.hull, occupied=np.ones((60, 60, 60), bool), origin=np.full(3, -3.0), voxel=0.1)
-            looks.append(replace(look, hull=hull, points=np.concatenate([base, strip])))
+        pieces = pieces_in_full_hulls(np.concatenate([base, strip]))
         hinge = Screw("revolute", torch.tensor([0.0, 0, 1]).double(), torch.tensor([-gap, 0.0, 0]).double())
         found = MovingPart(0, (door,), Hypothesis(hinge.motion(1.0), 0.0, 0.0, 0.0), 0.5, 0.1)
-        pieces = Pieces((looks[0], looks[1]), SMALL.search, seed=0)
         monkeypatch.setattr(pieces, "is_surface", lambda *_: False)
         boxes, _ = boxes_of_parts(pieces, [found], SMALL)
         by = SMALL.margin * 0.1
@@ -1311,13 +1320,9 @@ class TestBoxesOfParts:
         grip, below, upon = (
             g.uniform([low, -0.1, z], [high, 0.1, z + 0.1], (3000, 3)) for low, high, z in ((-1, 0, 0), (0.3, 2, 0), (0, 2, 0))
         )
-        looks = []
-        for look in looks_of("laptop")[1]:
-            hull = replace(look.hull, occupied=np.ones((60, 60, 60), bool), origin=np.full(3, -3.0), voxel=0.1)
-            looks.append(replace(look, hull=hull, points=np.concatenate([grip, below])))
+        pieces = pieces_in_full_hulls(np.concatenate([grip, below]))
         pin = Screw("revolute", torch.tensor([0.0, 0, 1]).double(), torch.zeros(3).double())
         found = MovingPart(0, (upon,), Hypothesis(pin.motion(0.5 * math.pi), 0.0, 0.0, 0.0), 0.5, 0.1)
-        pieces = Pieces((looks[0], looks[1]), SMALL.search, seed=0)
         monkeypatch.setattr(pieces, "is_surface", lambda _, state: surface and state == 1)
         boxes, _ = boxes_of_parts(pieces, [found], SMALL)
         by = SMALL.margin * 0.1

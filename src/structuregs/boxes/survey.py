@@ -106,14 +106,8 @@ def _still_points(looks: tuple[StateLook, StateLook], moving: list[tuple[Box, Bo
 
     Where boxes hold everything, all that both hulls hold.
     """
-    rows = []
-    for look, other in (looks, looks[::-1]):
-        points = torch.from_numpy(look.points)
-        still = torch.from_numpy(held_by_hull(look.points, other))
-        for pair in moving:
-            for box in pair:
-                still &= ~box.contains(points)
-        rows.append(look.points[still.numpy()])
+    boxes = [box for pair in moving for box in pair]
+    rows = [_outside(boxes, look, other) for look, other in (looks, looks[::-1])]
     hull = looks[0].hull
     return np.concatenate(rows) if any(map(len, rows)) else hull.centres(hull.occupied & looks[1].hull.occupied)
 
@@ -132,13 +126,18 @@ def _uncovered(pieces: Pieces, base: Box, moving: list[tuple[Box, Box]]) -> list
     looks = pieces.looks
     found = []
     for state, (look, other) in enumerate((looks, looks[::-1])):
-        points = torch.from_numpy(look.points)
-        free = torch.from_numpy(held_by_hull(look.points, other)) & ~base.contains(points)
-        for boxes in moving:
-            free &= ~boxes[state].contains(points)
-        some = linked(look.points[free.numpy()], pieces.config.cue, pieces.voxel)
+        free = _outside([base, *(pair[state] for pair in moving)], look, other)
+        some = linked(free, pieces.config.cue, pieces.voxel)
         found += [piece for piece in some if pieces.is_surface(piece, state)]
     return found
+
+
+def _outside(boxes: list[Box], look: StateLook, other: StateLook) -> Points:
+    """Surface points of a state in the hull of the other, outside some boxes."""
+    points, outside = torch.from_numpy(look.points), torch.from_numpy(held_by_hull(look.points, other))
+    for box in boxes:
+        outside &= ~box.contains(points)
+    return look.points[outside.numpy()]
 
 
 def boxes_at_rest(looks: tuple[StateLook, StateLook], count: int | None, config: StartConfig) -> tuple[Box, SE3]:
