@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from structuregs.capture import Capture, View, stack_views
-from structuregs.fit.evidence import alike_in_both, covered_in_both, outlined_in_both, seen_in_both, shown
+from structuregs.fit.evidence import alike_in_both, covered_in_both, outlined_in_both, seen_in_both, shown, supported
 from structuregs.geometry import SE3, Box, Camera
 from structuregs.joints import REVIEW_BELOW, articulate
 from structuregs.model import ArticulatedObject, PosedParts, Splats
@@ -182,6 +182,9 @@ def test_what_each_splat_paints_is_what_it_takes_part_in(capture: Capture, backe
     assert not each.requires_grad
     for some in (torch.arange(len(splats)) % 3 == 0, torch.arange(len(splats)) > len(splats) - 200):
         assert float(each[some].sum()) == pytest.approx(float(coverage_of(splats, some, camera).mean()), abs=2e-5)
+        left = torch.arange(camera.width) < camera.width / 2
+        here = painted(splats, camera, left.expand(camera.height, -1))
+        assert float(here[some].sum()) == pytest.approx(float((coverage_of(splats, some, camera) * left).mean()), abs=2e-5)
 
 
 def test_what_no_photo_shows_is_told_from_what_some_do(capture: Capture):
@@ -195,3 +198,44 @@ def test_what_no_photo_shows_is_told_from_what_some_do(capture: Capture):
     assert shell.float().mean() > 0.9
     assert not shut.any()
     assert out.float().mean() > 0.4
+
+
+def carried(ball: float) -> tuple[PosedParts, dict[str, slice]]:
+    """A closed box, and a part that slides by .25 along x: a ball beside the box, of some radius, and what it carries along.
+
+    In state 0 the box hides all but the ball of it; in state 1 some lies upon the box's side, and some above and beside it.
+    """
+    generator = torch.Generator().manual_seed(0)
+    spread = torch.rand(60, 3, generator=generator) - 0.5
+    round_ = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=-1)
+    means = {
+        "ball": torch.tensor([0.8, 0.0, 0.0]) + ball * round_,
+        "upon": torch.tensor([0.09, 0.0, -0.05]) + spread * torch.tensor([0.01, 0.2, 0.2]),
+        "beside": torch.tensor([0.22, 0.0, 0.24]) + spread * torch.tensor([0.04, 0.4, 0.04]),
+    }
+    boxes = Box(SE3.identity(2), torch.tensor([[0.3, 0.3, 0.3], [1.0, 1.0, 1.0]]))
+    slide = SE3.exp(torch.tensor([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    motions = SE3(torch.stack([SE3.identity().wxyz_xyz, slide.wxyz_xyz]))
+    splats = Splats.concatenate([blobs(walls(), 0.03), *(blobs(some, 0.01) for some in means.values())])
+    counts = (len(walls()), sum(map(len, means.values())))
+    places, start = {"box": slice(0, counts[0])}, counts[0]
+    for name, some in means.items():
+        places[name] = slice(start, start + len(some))
+        start += len(some)
+    return PosedParts(boxes, motions, splats, counts, torch.zeros(sum(counts), 3)), places
+
+
+def test_what_hangs_before_the_base_in_one_state_alone_has_no_support(capture: Capture):
+    photos = [stack_views(views, 64) for views in capture.train]
+    parts, places = carried(ball=0.15)
+    known = supported(parts, photos)
+    share = {name: float(known[where].float().mean()) for name, where in places.items()}
+    assert share["box"] == 1
+    assert share["ball"] == 1
+    assert share["beside"] > 0.7
+    assert share["upon"] < 0.1
+
+
+def test_all_of_a_part_that_shows_for_the_most_in_one_state_has_support(capture: Capture):
+    photos = [stack_views(views, 64) for views in capture.train]
+    assert supported(carried(ball=0.01)[0], photos).all()

@@ -17,7 +17,7 @@ from torch import Tensor
 from door_and_drawer import DOOR, DRAWER, made_of, photographed
 from structuregs.capture import stack_views
 from structuregs.export import part_meshes
-from structuregs.fit.boxes import base_tightened, drawn_out, squared_up, tightened
+from structuregs.fit.boxes import base_tightened, drawn_in, drawn_out, squared_up, tightened
 from structuregs.fit.densify import ScreenGradients, grow
 from structuregs.fit.events import Note
 from structuregs.fit.laying import BothStates
@@ -792,17 +792,61 @@ class TestResult:
         parts = stretched(1.7)
         slid = SE3(torch.tensor([[1.0, 0, 0, 0, 0, 0, 0], [1, 0, 0, 0, 0.3, 0, 0.1], [1, 0, 0, 0, 0, 0.2, 0]]))
         out, half_extents = replace(parts, motions=slid), parts.boxes.half_extents
-        length = float(half_extents[1, 0])
-        drawn = drawn_out(out, 0.65 * length)
+        length, every = float(half_extents[1, 0]), torch.ones(360, dtype=torch.bool)
+        drawn = drawn_out(out, every, 0.65 * length)
         expected = half_extents.clone()
         expected[1, 0] *= 1.632
         torch.testing.assert_close(drawn.boxes.half_extents, expected)
         for state in (0, 1):
             same_splats(drawn.at_state(state), out.at_state(state))
 
-        torch.testing.assert_close(drawn_out(out, 0.75 * length).boxes.half_extents, half_extents)
+        torch.testing.assert_close(drawn_out(out, every, 0.75 * length).boxes.half_extents, half_extents)
+        inside = (out.splats.means.abs() <= 1).all(-1)
+        torch.testing.assert_close(drawn_out(out, inside, 0.65 * length).boxes.half_extents, half_extents)
         faint = replace(out, splats=replace(out.splats, logit_opacities=torch.full_like(out.splats.logit_opacities, -3.0)))
-        torch.testing.assert_close(drawn_out(faint, 0.65 * length).boxes.half_extents, half_extents)
+        torch.testing.assert_close(drawn_out(faint, every, 0.65 * length).boxes.half_extents, half_extents)
+
+    def test_outside_its_box_a_splat_needs_support_once_boxes_fit(self, monkeypatch: pytest.MonkeyPatch):
+        parts = stretched(1.05)
+        inside = (parts.splats.means.abs() <= 1).all(-1)
+        assert 0 < int((~inside).sum()) < 20
+        monkeypatch.setattr("structuregs.fit.loop.supported", lambda *_: torch.arange(360) == 120)
+        fit = fitter(replace(QUICK, growth=Growth(interval=1, first=1.0, last=1.0)), parts)
+        assert not inside[120]
+        for step, gone in ((10, 0), (20, int((~inside).sum()) - 1)):
+            fit.state.step = step
+            fit._densify()
+            assert sum(fit.state.variables.counts) == 360 - gone
+
+    def test_boxes_of_what_moves_are_drawn_in_to_what_photos_support(self):
+        """Of the door's splats those from -1 to .8 along its box are supported: all but two in a hundred from -.98 to .78."""
+        parts = stretched(1.0)
+        row = torch.arange(360) - 120
+        supported = (row < 0) | (row >= 120) | (row < 0.9 * 120)
+        out, half = replace(parts, motions=DOOR_AND_DRAWER.motions), parts.boxes.half_extents
+        drawn = drawn_in(out, supported)
+        torch.testing.assert_close(drawn.boxes.half_extents[0], half[0])
+        ends = half[1, 0] * torch.tensor([[-0.98, 0, 0], [0.78, 0, 0]])
+        sides = drawn.boxes[1].half_extents * torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
+        placed = out.boxes[1].T_world_box.inverse().apply(drawn.boxes[1].T_world_box.apply(sides))[:, 0]
+        torch.testing.assert_close(placed, ends[:, 0], rtol=0, atol=0.02 * float(half[1, 0]))
+        for state in (0, 1):
+            same_splats(drawn.at_state(state), out.at_state(state))
+
+        far = drawn_in(stretched(3.0), torch.ones(360, dtype=torch.bool)).boxes.half_extents
+        assert (far <= half * (1 + 1e-6)).all(), "never out"
+        few = supported & ((row >= 120) | (row < 60))
+        torch.testing.assert_close(drawn_in(out, few).boxes.half_extents[1], half[1])
+
+    def test_the_box_of_what_slides_is_left_as_long_as_it_is(self):
+        parts = stretched(1.0)
+        along = parts.boxes.T_world_box.rotation[1] @ torch.tensor([0.3, 0.01, -0.02])
+        slid = parts.motions.wxyz_xyz.clone()
+        slid[1] = torch.cat([torch.tensor([1.0, 0, 0, 0]), along])
+        row = torch.arange(360) - 120
+        supported = (row < 0) | (row >= 120) | (row < 0.9 * 120)
+        drawn = drawn_in(replace(parts, motions=SE3(slid)), supported)
+        assert float(drawn.boxes.half_extents[1, 0]) == pytest.approx(float(parts.boxes.half_extents[1, 0]), rel=1e-5)
 
     def test_a_box_is_not_drawn_out_over_its_hinge(self):
         """The splats reach beyond both ends of the box alike; only the end that the motion moves is drawn out."""
@@ -811,7 +855,8 @@ class TestResult:
         hinge = pose.apply(half * torch.tensor([-1.4, 0.0, 0.0]))
         motions = parts.motions.wxyz_xyz.clone()
         motions[1] = Screw("revolute", pose.rotation[:, 2], hinge).motion(1.0).wxyz_xyz
-        drawn = drawn_out(replace(parts, motions=SE3(motions)), 0.6 * float(half[0])).boxes[1]
+        every = torch.ones(360, dtype=torch.bool)
+        drawn = drawn_out(replace(parts, motions=SE3(motions)), every, 0.6 * float(half[0])).boxes[1]
         sides = drawn.half_extents * torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
         ends = pose.inverse().apply(drawn.T_world_box.apply(sides))[:, 0]
         torch.testing.assert_close(ends, half[0] * torch.tensor([-1.0, 1.65]), rtol=0.01, atol=0.0)

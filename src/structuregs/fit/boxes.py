@@ -1,10 +1,11 @@
 """Boxes that follow what their splats have become."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..geometry import SE3, Box
+from ..joints import kind_of
 from ..model import PosedParts
 from ..points import face_axes
 
@@ -12,7 +13,8 @@ _OPAQUE = 0.3  # opacity from which a splat counts
 _ENOUGH = 10  # opaque splats that say how far a box reaches...
 _FACES = 100  # ...and so many which way it lies
 _PRESSING, _MANY = 0.9, 0.02  # of how far splats may lie outside their box: so many of them as far as that would go farther
-_STRAY = 0.002  # of a part's splats: so few may stick out of its box
+_STRAY = 0.002  # of a part's splats: so few may stick out of its box...
+_FEW = 0.01  # ...and of those that photos support, while it is fitted
 _CELL = 0.005  # of the base's longest half extent: how finely layers of splats are told apart
 
 
@@ -34,7 +36,30 @@ def base_tightened(parts: PosedParts) -> PosedParts:
     return parts.in_box(0, _tight(parts, 0))
 
 
-def drawn_out(parts: PosedParts, reach: float) -> PosedParts:
+def drawn_in(parts: PosedParts, supported: Bool[Tensor, " N"]) -> PosedParts:
+    """The same with the boxes of what moves drawn in to their opaque splats that photos support.
+
+    What slides is left as long as it is: the end of a drawer that is in its cabinet is out of sight.
+
+    Args:
+        parts: as fitted so far.
+        supported: by photos (`evidence.supported`).
+    """
+    parts = parts.detach()
+    for k in range(1, len(parts)):
+        box, opaque = parts.boxes[k], _opaque(parts, k, supported)
+        if len(opaque) > _FACES:
+            low, high = _span(opaque, _FEW)
+            low, high = torch.maximum(low, -box.half_extents), torch.minimum(high, box.half_extents)
+            if kind_of(parts.motions[k]) == "prismatic":
+                way = parts.motions[k].apply(box.T_world_box.xyz) - box.T_world_box.xyz
+                slide = (box.T_world_box.rotation.T @ way).abs().argmax()
+                low[slide], high[slide] = -box.half_extents[slide], box.half_extents[slide]
+            parts = parts.in_box(k, _spanning(box, low, high))
+    return parts
+
+
+def drawn_out(parts: PosedParts, supported: Bool[Tensor, " N"], reach: float) -> PosedParts:
     """The same with the boxes of what moves drawn out to their opaque splats, where many of these lie as far out as they may.
 
     A blade's tip that the search cut off then has room to grow on.  Splats that move less than half as far as most of the part
@@ -42,11 +67,12 @@ def drawn_out(parts: PosedParts, reach: float) -> PosedParts:
 
     Args:
         parts: as fitted so far.
+        supported: by photos; others do not count.
         reach: how far outside their box splats may lie, world units.
     """
     parts = parts.detach()
     for k in range(1, len(parts)):
-        box, opaque = parts.boxes[k], _opaque(parts, k)
+        box, opaque = parts.boxes[k], _opaque(parts, k, supported)
         if len(opaque) > _ENOUGH:
             points = box.T_world_box.apply(opaque)
             travel = (parts.motions[k].apply(points) - points).norm(dim=-1)
@@ -72,10 +98,13 @@ def squared_up(parts: PosedParts) -> PosedParts:
     return parts
 
 
-def _opaque(parts: PosedParts, k: int) -> Float[Tensor, "P 3"]:
-    """A part's opaque splats, from its box's centre along its axes, world units."""
+def _opaque(parts: PosedParts, k: int, which: Bool[Tensor, " N"] | None = None) -> Float[Tensor, "P 3"]:
+    """A part's opaque splats, of some alone where these are given, from its box's centre along its axes, world units."""
     splats = parts.part_splats(k)
-    return splats.means[splats.opacities > _OPAQUE] * parts.boxes.half_extents[k]
+    chosen = splats.opacities > _OPAQUE
+    if which is not None:
+        chosen &= which.split(parts.counts)[k]
+    return splats.means[chosen] * parts.boxes.half_extents[k]
 
 
 def _span(points: Float[Tensor, "P 3"], but: float) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:

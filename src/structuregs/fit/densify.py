@@ -103,7 +103,7 @@ def grow(
     growth: Growth,
     size: float,
     generator: torch.Generator,
-    shown: Bool[Tensor, " N"] | None = None,
+    stay: Bool[Tensor, " N"] | None = None,
 ) -> tuple[Variables, Int[Tensor, " M"], Bool[Tensor, " M"]]:
     """One round: prunes, and where gradients are given clones small splats and splits large ones.
 
@@ -113,7 +113,7 @@ def grow(
         growth: thresholds.
         size: of the object, world units.
         generator: for the places of the halves.
-        shown: splats that some photo shows, the others go; None: all stay.
+        stay: splats that may, the others go; None: all may.
 
     Returns:
         Variables after, each part's splats in the order of a curve through its box; for each splat the index of the one it
@@ -121,8 +121,8 @@ def grow(
     """
     count = sum(variables.counts)
     keep = prune_mask(variables, growth, size)
-    if shown is not None:
-        keep &= shown
+    if stay is not None:
+        keep &= stay
     device = keep.device
     clone = split = torch.zeros(count, dtype=torch.bool, device=device)
     if gradients is not None:

@@ -22,6 +22,7 @@ _PHOTOS = 16  # of either state
 _ENOUGH = 0.2  # of what a part that slides shows in one state: as much in the other leaves nothing to wish for; ...
 _ENOUGH_TURNED = 0.35  # ...of one that turns, whose rim alone does not say about which hinge
 _TRACE = 2e-6  # of a photo: a splat that paints less in all of them is not missed
+_EITHER = 0.2  # of what a splat paints in both states: so much in either, and both show it
 _EMPTY = 0.5  # of a pixel: what covers more covers it, and mask and model that differ by more see it differently
 _GAPS, _HOLE = 0.005, 0.08  # of what photos show: nothing to say of so much uncovered; as much more leaves no confidence
 _RIM, _BESIDE = 0.003, 0.012  # of the pixels that a part covers: the same of pixels that masks and model see differently
@@ -45,11 +46,51 @@ def shown(parts: PosedParts, photos: Sequence[ImageStack]) -> Bool[Tensor, " N"]
     most = torch.zeros_like(parts.splats.logit_opacities)
     for state, stack in enumerate(photos):
         splats = parts.at_state(state)
-        for camera in (stack.cameras[v] for v in spread_cameras(stack.cameras, _LOOKS)):
-            scale = min(1.0, _LOOK / (camera.width * camera.height) ** 0.5)
-            small = camera.resized(round(camera.width * scale), round(camera.height * scale))
-            most = torch.maximum(most, painted(splats, small))
+        for camera in _small(stack, _LOOKS, _LOOK):
+            most = torch.maximum(most, painted(splats, camera))
     return most > _TRACE
+
+
+def _small(stack: ImageStack, count: int, size: int) -> list[Camera]:
+    """Some of the cameras, for pictures with at most as many pixels as a square of that size."""
+    cameras = [stack.cameras[v] for v in spread_cameras(stack.cameras, count)]
+    scales = [min(1.0, size / (camera.width * camera.height) ** 0.5) for camera in cameras]
+    return [c.resized(round(c.width * scale), round(c.height * scale)) for c, scale in zip(cameras, scales, strict=True)]
+
+
+@torch.no_grad()
+def supported(parts: PosedParts, photos: Sequence[ImageStack]) -> Bool[Tensor, " N"]:
+    """Splats that both states show, or that stand before nothing but their own part in the one that shows them.
+
+    With few views what moves carries splats along that hang before what stands still in one state, in its colours, and are out
+    of sight in the other: the base can paint the same.  All of the base is supported, and all of a part that shows for the
+    most in one state alone.
+
+    Args:
+        parts: as fitted so far.
+        photos: of either state.
+    """
+    posed = [parts.at_state(s) for s in (0, 1)]
+    cameras = [_small(stack, _PHOTOS, _SIZE) for stack in photos]
+    each = [[painted(splats, c) / len(row) for c in row] for splats, row in zip(posed, cameras, strict=True)]
+    shares = torch.stack([torch.stack(row).sum(0) for row in each])
+    total = shares.sum(0)
+    known = shares.amin(0) >= _EITHER * total
+    part = parts.part.to(total.device)
+    for k in range(1, len(parts)):
+        own = part == k
+        doubtful = own & ~known
+        if total[doubtful].sum() > total[own].sum() / 2:
+            known |= own
+            continue
+        alone = torch.zeros_like(total)
+        for splats, row, paints in zip(posed, cameras, each, strict=True):
+            for camera, paint in zip(row, paints, strict=True):
+                if paint[doubtful].sum() > _TRACE:
+                    behind = coverage_of(splats[~doubtful], ~own[~doubtful], camera)
+                    alone += painted(splats, camera, behind < _EMPTY) / len(row)
+        known |= doubtful & (alone >= total / 2)
+    return known | (part == 0)
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from ..capture import Capture, ImageStack, stack_views
@@ -15,10 +16,10 @@ from ..joints import kind_of
 from ..model import PosedParts, Splats
 from ..raster import Render, image_loss, render
 from .aim import beside, misaim, offset_gradient, with_coverage
-from .boxes import base_tightened, drawn_out, squared_up
+from .boxes import base_tightened, drawn_in, drawn_out, squared_up
 from .densify import ScreenGradients, grow
 from .events import FitEvent, Note, Step
-from .evidence import shown
+from .evidence import shown, supported
 from .laying import laid_anew
 from .merge import idle_part, moving_alike
 from .schedule import FitConfig
@@ -103,10 +104,13 @@ class Fitter:
     def _square_up(self) -> None:
         """Turns boxes along the faces of their parts, as joints are drawn to the axes of the base's.
 
-        The base's is also made tight, and those of what moves are drawn out where splats press on.
+        The base's is also made tight, and those of what moves are drawn in to what photos support, and out where that
+        presses on.
         """
         variables, reach = self.state.variables, self.config.growth.reach * self.state.size
-        parts = drawn_out(base_tightened(squared_up(variables.parts())), reach)
+        parts = base_tightened(squared_up(variables.parts()))
+        known = supported(parts, self._aimed_images())
+        parts = drawn_out(drawn_in(parts, known), known, reach)
         for name in ("means", "quats", "sh"):
             variables.leaves[name].copy_(getattr(parts.splats, name))
         variables.set_boxes(parts.boxes)
@@ -295,17 +299,30 @@ class Fitter:
                 leaf.addcdiv_(first, second.sqrt().add_(1e-15), value=-rate * correction)
             leaf.grad = None
 
+    @torch.no_grad()
+    def _founded(self, *, last: bool) -> Bool[Tensor, " N"] | None:
+        """Splats that may stay, as photos have it; None for all.
+
+        After the last step those that some photo shows; once boxes fit their parts, what is outside of its box needs support.
+        """
+        parts = self.state.variables.parts().detach()
+        if last:
+            return shown(parts, self._aimed_images())
+        if self.state.step < min(self.config.square_at, default=1.0) * self.config.steps:
+            return None
+        return (parts.splats.means.abs() <= 1).all(-1) | supported(parts, self._aimed_images())
+
     def _densify(self) -> None:
-        """A round of densification or of pruning, where the schedule asks for one; after the last step the unseen go."""
+        """A round of densification or of pruning, where the schedule asks for one; what photos give no reason for goes."""
         config, growth, done = self.config, self.config.growth, self.state.step + 1
         last = done == config.steps
         if done <= config.image_from or (done % growth.interval and not last):
             return
         growing = growth.first * config.steps < done <= growth.last * config.steps and not last
-        seen = shown(self.state.variables.parts(), self._aimed_images()) if last else None
+        stay = self._founded(last=last)
         noise = torch.Generator().manual_seed(int(np.random.default_rng((self.seed, self.state.step)).integers(2**62)))
         gradients = self.state.gradients if growing else None
-        self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.state.size, noise, seen)
+        self.state.variables, source, fresh = grow(self.state.variables, gradients, growth, self.state.size, noise, stay)
         for name in SPLAT_NAMES:
             first, second = (moment[source] for moment in self.state.moments[name])
             first[fresh], second[fresh] = 0, 0

@@ -127,7 +127,8 @@ class FitConfig:
     """Part of the fit up to which joints that begin along the base's box stay along it.  While splats settle, photos of a plain
     front draw its axis aside, and splats then hold it there; one that is truly askew comes home afterwards.  0 for none."""
     square_at: tuple[float, ...] = (0.35, 0.6)
-    """Parts of the fit after which boxes are turned along the faces of their parts, and drawn out where splats press on."""
+    """Parts of the fit after which boxes are turned along the faces of their parts, drawn in to what photos support, and drawn
+    out where splats press on.  From the first on splats need support outside their box."""
     join_at: float = 0.35
     """Part of the fit after which parts that touch and move alike are made one, and what need not move is left to the base;
     1 for never."""

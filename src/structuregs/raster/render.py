@@ -56,14 +56,18 @@ def coverage_of(splats: Splats, chosen: Bool[Tensor, " N"], camera: Camera, dila
     return render(replace(splats, sh=sh), camera, background=black, dilation=dilation).rgb[..., 0]
 
 
-def painted(splats: Splats, camera: Camera) -> Float[Tensor, " N"]:
-    """The share of the image that each splat paints, where others may stand before it; they add up to the mean alpha."""
+def painted(splats: Splats, camera: Camera, pixels: Bool[Tensor, "H W"] | None = None) -> Float[Tensor, " N"]:
+    """The share of the image that each splat paints, where others may stand before it; they add up to the mean alpha.
+
+    Where `pixels` are given, others count as not painted.
+    """
     with torch.no_grad():
         projection = project(splats, camera)
     with torch.enable_grad():
         rgb = projection.rgb.clone().requires_grad_()
         picture = blend(replace(projection, rgb=rgb), camera.width, camera.height, splats.means.new_zeros(3))
-        (weights,) = torch.autograd.grad(picture.rgb[..., 0].mean(), rgb)
+        drawn = picture.rgb[..., 0] if pixels is None else picture.rgb[..., 0] * pixels
+        (weights,) = torch.autograd.grad(drawn.mean(), rgb)
     return weights[:, 0]
 
 
