@@ -5,12 +5,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from structuregs.capture import Capture, View, stack_views
 from structuregs.fit.evidence import alike_in_both, covered_in_both, outlined_in_both, seen_in_both, shown, supported
-from structuregs.geometry import SE3, Box, Camera
+from structuregs.geometry import SE3, Box, Camera, Screw
 from structuregs.joints import REVIEW_BELOW, articulate
 from structuregs.model import ArticulatedObject, PosedParts, Splats
 from structuregs.raster import coverage_of, painted, render
@@ -200,8 +201,12 @@ def test_what_no_photo_shows_is_told_from_what_some_do(capture: Capture):
     assert out.float().mean() > 0.4
 
 
-def carried(ball: float) -> tuple[PosedParts, dict[str, slice]]:
-    """A closed box, and a part that slides by .25 along x: a ball beside the box, of some radius, and what it carries along.
+TURN = Screw("revolute", torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, -2.5])).motion(0.1)
+SLIDE = SE3.exp(torch.tensor([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def carried(ball: float, motion: SE3) -> tuple[PosedParts, dict[str, slice]]:
+    """A closed box, and a part that goes a quarter of a unit along x: a ball of some radius beside the box, and more.
 
     In state 0 the box hides all but the ball of it; in state 1 some lies upon the box's side, and some above and beside it.
     """
@@ -209,26 +214,23 @@ def carried(ball: float) -> tuple[PosedParts, dict[str, slice]]:
     spread = torch.rand(60, 3, generator=generator) - 0.5
     round_ = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=-1)
     means = {
+        "box": walls(),
         "ball": torch.tensor([0.8, 0.0, 0.0]) + ball * round_,
         "upon": torch.tensor([0.09, 0.0, -0.05]) + spread * torch.tensor([0.01, 0.2, 0.2]),
         "beside": torch.tensor([0.22, 0.0, 0.24]) + spread * torch.tensor([0.04, 0.4, 0.04]),
     }
     boxes = Box(SE3.identity(2), torch.tensor([[0.3, 0.3, 0.3], [1.0, 1.0, 1.0]]))
-    slide = SE3.exp(torch.tensor([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    motions = SE3(torch.stack([SE3.identity().wxyz_xyz, slide.wxyz_xyz]))
-    splats = Splats.concatenate([blobs(walls(), 0.03), *(blobs(some, 0.01) for some in means.values())])
-    counts = (len(walls()), sum(map(len, means.values())))
-    places, start = {"box": slice(0, counts[0])}, counts[0]
-    for name, some in means.items():
-        places[name] = slice(start, start + len(some))
-        start += len(some)
-    return PosedParts(boxes, motions, splats, counts, torch.zeros(sum(counts), 3)), places
+    motions = SE3(torch.stack([SE3.identity().wxyz_xyz, motion.wxyz_xyz.float()]))
+    splats = Splats.concatenate(blobs(some, 0.03 if name == "box" else 0.01) for name, some in means.items())
+    counts = (len(means["box"]), len(splats) - len(means["box"]))
+    ends = np.cumsum([len(some) for some in means.values()]).tolist()
+    places = {name: slice(end - len(some), end) for (name, some), end in zip(means.items(), ends, strict=True)}
+    return PosedParts(boxes, motions, splats, counts, torch.zeros(len(splats), 3)), places
 
 
 def test_what_hangs_before_the_base_in_one_state_alone_has_no_support(capture: Capture):
-    photos = [stack_views(views, 64) for views in capture.train]
-    parts, places = carried(ball=0.15)
-    known = supported(parts, photos)
+    parts, places = carried(ball=0.15, motion=TURN)
+    known = supported(parts, [stack_views(views, 64) for views in capture.train])
     share = {name: float(known[where].float().mean()) for name, where in places.items()}
     assert share["box"] == 1
     assert share["ball"] == 1
@@ -236,6 +238,6 @@ def test_what_hangs_before_the_base_in_one_state_alone_has_no_support(capture: C
     assert share["upon"] < 0.1
 
 
-def test_all_of_a_part_that_shows_for_the_most_in_one_state_has_support(capture: Capture):
-    photos = [stack_views(views, 64) for views in capture.train]
-    assert supported(carried(ball=0.01)[0], photos).all()
+@pytest.mark.parametrize(("ball", "motion"), [(0.01, TURN), (0.15, SLIDE)])
+def test_all_has_support_of_what_slides_or_shows_for_the_most_in_one_state(capture: Capture, ball: float, motion: SE3):
+    assert supported(carried(ball, motion)[0], [stack_views(views, 64) for views in capture.train]).all()

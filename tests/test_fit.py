@@ -838,16 +838,6 @@ class TestResult:
         few = supported & ((row >= 120) | (row < 60))
         torch.testing.assert_close(drawn_in(out, few).boxes.half_extents[1], half[1])
 
-    def test_the_box_of_what_slides_is_left_as_long_as_it_is(self):
-        parts = stretched(1.0)
-        along = parts.boxes.T_world_box.rotation[1] @ torch.tensor([0.3, 0.01, -0.02])
-        slid = parts.motions.wxyz_xyz.clone()
-        slid[1] = torch.cat([torch.tensor([1.0, 0, 0, 0]), along])
-        row = torch.arange(360) - 120
-        supported = (row < 0) | (row >= 120) | (row < 0.9 * 120)
-        drawn = drawn_in(replace(parts, motions=SE3(slid)), supported)
-        assert float(drawn.boxes.half_extents[1, 0]) == pytest.approx(float(parts.boxes.half_extents[1, 0]), rel=1e-5)
-
     def test_a_box_is_not_drawn_out_over_its_hinge(self):
         """The splats reach beyond both ends of the box alike; only the end that the motion moves is drawn out."""
         parts = stretched(1.7)

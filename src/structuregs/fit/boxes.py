@@ -5,7 +5,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..geometry import SE3, Box
-from ..joints import kind_of
 from ..model import PosedParts
 from ..points import face_axes
 
@@ -39,8 +38,6 @@ def base_tightened(parts: PosedParts) -> PosedParts:
 def drawn_in(parts: PosedParts, supported: Bool[Tensor, " N"]) -> PosedParts:
     """The same with the boxes of what moves drawn in to their opaque splats that photos support.
 
-    What slides is left as long as it is: the end of a drawer that is in its cabinet is out of sight.
-
     Args:
         parts: as fitted so far.
         supported: by photos (`evidence.supported`).
@@ -51,10 +48,6 @@ def drawn_in(parts: PosedParts, supported: Bool[Tensor, " N"]) -> PosedParts:
         if len(opaque) > _FACES:
             low, high = _span(opaque, _FEW)
             low, high = torch.maximum(low, -box.half_extents), torch.minimum(high, box.half_extents)
-            if kind_of(parts.motions[k]) == "prismatic":
-                way = parts.motions[k].apply(box.T_world_box.xyz) - box.T_world_box.xyz
-                slide = (box.T_world_box.rotation.T @ way).abs().argmax()
-                low[slide], high[slide] = -box.half_extents[slide], box.half_extents[slide]
             parts = parts.in_box(k, _spanning(box, low, high))
     return parts
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..boxes import Face, Overlap
 from ..capture import Capture, ImageStack, spread_cameras, stack_views
 from ..geometry import Camera
-from ..joints import REVIEW_BELOW
+from ..joints import REVIEW_BELOW, kind_of
 from ..model import ArticulatedObject, Joint, PosedParts, Splats
 from ..raster import coverage_of, painted, render
 from .laying import BothStates
@@ -63,8 +63,8 @@ def supported(parts: PosedParts, photos: Sequence[ImageStack]) -> Bool[Tensor, "
     """Splats that both states show, or that stand before nothing but their own part in the one that shows them.
 
     With few views what moves carries splats along that hang before what stands still in one state, in its colours, and are out
-    of sight in the other: the base can paint the same.  All of the base is supported, and all of a part that shows for the
-    most in one state alone.
+    of sight in the other: the base can paint the same.  All of the base is supported, all of a part that shows for the most in
+    one state alone, and all of what slides: the end of a drawer that is in its cabinet hangs there as well.
 
     Args:
         parts: as fitted so far.
@@ -80,7 +80,7 @@ def supported(parts: PosedParts, photos: Sequence[ImageStack]) -> Bool[Tensor, "
     for k in range(1, len(parts)):
         own = part == k
         doubtful = own & ~known
-        if total[doubtful].sum() > total[own].sum() / 2:
+        if kind_of(parts.motions[k]) == "prismatic" or total[doubtful].sum() > total[own].sum() / 2:
             known |= own
             continue
         alone = torch.zeros_like(total)
