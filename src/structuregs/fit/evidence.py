@@ -74,9 +74,8 @@ def supported(parts: PosedParts, photos: Sequence[ImageStack]) -> Bool[Tensor, "
     cameras = [_small(stack, _PHOTOS, _SIZE) for stack in photos]
     each = [[painted(splats, c) / len(row) for c in row] for splats, row in zip(posed, cameras, strict=True)]
     shares = torch.stack([torch.stack(row).sum(0) for row in each])
-    total = shares.sum(0)
-    known = shares.amin(0) >= _EITHER * total
-    part = parts.part.to(total.device)
+    total, part = shares.sum(0), parts.part.to(shares.device)
+    known = (shares.amin(0) >= _EITHER * total) | (part == 0)
     for k in range(1, len(parts)):
         own = part == k
         doubtful = own & ~known
@@ -85,12 +84,19 @@ def supported(parts: PosedParts, photos: Sequence[ImageStack]) -> Bool[Tensor, "
             continue
         alone = torch.zeros_like(total)
         for splats, row, paints in zip(posed, cameras, each, strict=True):
-            for camera, paint in zip(row, paints, strict=True):
-                if paint[doubtful].sum() > _TRACE:
-                    behind = coverage_of(splats[~doubtful], ~own[~doubtful], camera)
-                    alone += painted(splats, camera, behind < _EMPTY) / len(row)
+            showing = [c for c, paint in zip(row, paints, strict=True) if paint[doubtful].sum() > _TRACE]
+            for camera in showing:
+                alone += _painted_alone(splats, own, doubtful, camera) / len(row)
         known |= doubtful & (alone >= total / 2)
-    return known | (part == 0)
+    return known
+
+
+def _painted_alone(
+    splats: Splats, own: Bool[Tensor, " N"], doubtful: Bool[Tensor, " N"], camera: Camera
+) -> Float32[Tensor, " N"]:
+    """What each splat paints of an image where, without some of a part's splats, nothing shows but that part."""
+    others = coverage_of(splats[~doubtful], ~own[~doubtful], camera)
+    return painted(splats, camera, others < _EMPTY)
 
 
 @torch.no_grad()
