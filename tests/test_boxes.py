@@ -52,6 +52,7 @@ from structuregs.model import SH_C0, Splats
 from structuregs.points import points_from
 from structuregs.raster import render
 from structuregs.synthetic import KnownObject, Lighting, RenderOptions, make_capture, make_object
+from structuregs.synthetic.catalog import Front, _cupboard
 
 F64 = torch.float64
 SMALL = StartConfig(
@@ -321,7 +322,11 @@ def true_parts_of(name: str) -> tuple[PartReview, list[MovingPart]]:
 
     The weightiest comes first, as in a search.
     """
-    obj, looks = looks_of(name)
+    return true_parts(*looks_of(name))
+
+
+def true_parts(obj: KnownObject, looks: tuple[StateLook, StateLook]) -> tuple[PartReview, list[MovingPart]]:
+    """`true_parts_of`, of an object and its survey."""
     pieces = Pieces(looks, SMALL.search, seed=0)
     margin = 1.5 * pieces.voxel
     parts = []
@@ -888,6 +893,40 @@ class TestPartsThatMayBeOne:
         assert search._whole_again(parts) == parts
 
 
+@lru_cache
+def doors_as_one(lower: float, upper: float) -> tuple[PartReview, MovingPart, list[MovingPart]]:
+    """Two doors above each other, shut in state 0, that open by so many degrees; both as one that opens as the lower does.
+
+    Returns:
+        Who reviews them, both as one, and each.
+    """
+    rows = [[Front("door", 0.0, degrees)] for degrees in (lower, upper)]
+    obj = _cupboard("doors", np.random.default_rng(0), 0.8, 0.7, 1.4, rows)
+    capture = make_capture(obj, RenderOptions(size=128, views=24, test_views=1, samples=2))
+    review, parts = true_parts(obj, survey(capture, None, SMALL, seed=0))
+    one, two = sorted(parts, key=lambda part: part.points[:, 2].mean())
+    return review, replace(one, pieces=(np.concatenate([one.points, two.points]),), weight=one.weight + two.weight), [one, two]
+
+
+class TestPartsThatGoNearlyAsFar:
+    def test_doors_above_each_other_are_told_apart_each_with_its_angle(self):
+        review, both, parts = doors_as_one(50.0, 56.0)
+        found = sorted(review._told_apart([both]), key=lambda part: part.points[:, 2].mean())
+        assert len(found) == 2
+        for part, true, degrees in zip(found, parts, (50.0, 56.0), strict=True):
+            assert abs(len(part.points) - len(true.points)) < 0.1 * len(true.points)
+            _, q = screw_at(part.hypothesis.motion, "revolute", torch.zeros(3, dtype=F64))
+            assert math.degrees(float(q)) == pytest.approx(degrees, abs=2)
+
+    def test_doors_that_open_alike_stay_as_they_are(self):
+        review, both, _ = doors_as_one(50.0, 50.0)
+        assert review._told_apart([both]) == [both]
+
+    def test_each_stays_what_it_is(self):
+        review, _, parts = doors_as_one(50.0, 56.0)
+        assert review._told_apart(parts) == parts
+
+
 class TestReview:
     """The laptop's screen, found rightly and wrongly."""
 
@@ -1211,7 +1250,7 @@ class TestCutAcross:
             (len(tried), 600)
         )
         along = Screw(kind, torch.tensor([0.0, 1, 0], dtype=F64), torch.zeros(3, dtype=F64))  # pyright: ignore[reportArgumentType]
-        return cut_across(points, self.BOX, fronts, support, along, voxel, 1.13)
+        return [points[within] for within, _ in cut_across(points, self.BOX, fronts, support, along, voxel, 1.13, 1.04)]
 
     def test_drawers_that_come_out_differently_are_cut_where_they_meet(self):
         pieces = sorted(self.pieces((0.6, 1.0, 0.8)), key=lambda piece: piece[:, 0].mean())

@@ -15,11 +15,13 @@ from .cue import CueConfig, Points, box_around, linked, one_box_holds
 FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
 """How far along its own way a motion is tried, against what suits the cluster best as a whole."""
 
+FINELY = tuple(1 + 0.02 * step for step in range(-10, 11))
+"""How far along its own way a piece of a part is tried that goes nearly as far as the rest."""
+
 AROUND = (0.8, 0.9, 1.0, 1.1, 1.2)
 """The same for what may move along with a part: best at one of the middle three."""
 
-_BETTER = 1.04  # what is cut must explain so many times what it did before...
-_EACH = 0.08  # ...and every piece this share of what all do as one, and of the points
+_EACH = 0.08  # of what all explain as one, and of the points: every piece of what is cut has so much
 _NARROWEST = 4  # voxels: no part beside another is narrower
 _POOL = 24  # neighbours over which a splat's support is averaged
 _VOTERS = 12  # splats around a point that say what it belongs to
@@ -137,7 +139,8 @@ def cut_across(
     screw: Screw,
     voxel: float,
     together: float,
-) -> list[Points]:
+    each: float,
+) -> list[tuple[Bool[np.ndarray, " P"], int]]:
     """The points of one cluster, cut where pieces of it would rather go ways of their own along its motion.
 
     Drawers side by side and doors one above the other are one cluster if they touch, and shut they show their fronts alone,
@@ -150,7 +153,11 @@ def cut_across(
         support: of each of them for each of the factors, moved there or brought back (see `Scene.support`).
         screw: along which the cluster moves as a whole; cuts leave its way uncut.
         voxel: of the hull, world units.
-        together: the pieces must explain so many times what they do as one.
+        together: the pieces must explain so many times what they do as one...
+        each: ...and every cut so many times what was explained before it.
+
+    Returns:
+        Of each piece, which points are its own, and the index of the factor that suits it.
     """
     towards = (box.T_world_box.rotation.T @ screw.axis).abs()
     unmoved = towards < 0.2 if screw.kind == "prismatic" else towards > 0.98
@@ -158,10 +165,15 @@ def cut_across(
     axes = [int(axis) for axis in torch.nonzero(unmoved & wide).flatten()]
     common = float(support.sum(1).max())
     local = box.to_canonical(torch.from_numpy(points)).numpy()
-    pieces = _cut(places, support, local, axes, (_EACH * common, _EACH * len(local)))
-    if sum(reached for _, reached in pieces) < together * common:
-        return [points]
-    return [points[np.all((local > low) & (local <= high), axis=1)] for (low, high), _ in pieces]
+    pieces = _cut(places, support, local, axes, each, (_EACH * common, _EACH * len(local)))
+    if sum(float(reached.max()) for _, reached in pieces) < together * common:
+        pieces = [(_everywhere(), support.sum(1))]
+    within = [np.all((local > low) & (local <= high), axis=1) for (low, high), _ in pieces]
+    return [(inside, int(reached.argmax())) for inside, (_, reached) in zip(within, pieces, strict=True)]
+
+
+def _everywhere() -> Float64[np.ndarray, "2 3"]:
+    return np.array([[-np.inf] * 3, [np.inf] * 3])
 
 
 def _cut(
@@ -169,19 +181,20 @@ def _cut(
     support: Float64[np.ndarray, "F N"],
     points: Float64[np.ndarray, "P 3"],
     axes: list[int],
+    better: float,
     least: tuple[float, float],
-) -> list[tuple[Float64[np.ndarray, "2 3"], float]]:
-    """Lowest and highest corner of the pieces that had each better move by itself, and what each reaches.
+) -> list[tuple[Float64[np.ndarray, "2 3"], Float64[np.ndarray, " F"]]]:
+    """Lowest and highest corner of the pieces that had each better move by itself, and what each reaches for each factor.
 
     Args:
         fronts: places of splats.
         support: of each splat for each factor of a motion.
         points: of what is cut.
         axes: across which cuts are allowed.
+        better: how many times as much as before is reached after a cut.
         least: what each piece must reach, and how many points it must hold.
     """
-    whole = float(support.sum(1).max())
-    best, found = _BETTER * whole, None
+    best, found = better * float(support.sum(1).max()), None
     for axis in axes:
         order = np.argsort(fronts[:, axis], kind="stable")
         levels = (fronts[order[:-1], axis] + fronts[order[1:], axis]) / 2
@@ -193,11 +206,11 @@ def _cut(
         if len(both) and both.max() > best:
             best, found = both.max(), (axis, levels[both.argmax()])
     if found is None:
-        return [(np.array([[-np.inf] * 3, [np.inf] * 3]), whole)]
+        return [(_everywhere(), support.sum(1))]
     axis, level = found
     low, under = fronts[:, axis] <= level, points[:, axis] <= level
-    below = _cut(fronts[low], support[:, low], points[under], axes, least)
-    above = _cut(fronts[~low], support[:, ~low], points[~under], axes, least)
+    below = _cut(fronts[low], support[:, low], points[under], axes, better, least)
+    above = _cut(fronts[~low], support[:, ~low], points[~under], axes, better, least)
     for bounds, _ in below:
         bounds[1, axis] = min(bounds[1, axis], level)
     for bounds, _ in above:

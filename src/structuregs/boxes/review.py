@@ -18,6 +18,7 @@ from .hypotheses import Hypothesis, displacements, distinct, flips, stack_motion
 from .judge import Trial
 from .pieces import MovingPart, Pieces
 from .refine import just_out_of_sight, measured
+from .several import nearly_alike
 
 _NO_SCRAP = 0.5  # of a part's weight, of the 2 that it could: what explains so much is no scrap, wherever it lies
 _BLURRED = 1.5  # voxels: no nearer is found how a piece moves that does not show in the other state
@@ -34,7 +35,8 @@ class PartReview:
         """The parts as all of them together say."""
         parts = self.exchanged(self.without_doubles(found))
         parts = self._reconsider(self.joined([self.at_its_clearest(part) for part in parts]))
-        return self.going_somewhere([self._laid_alike(part) for part in self._settled(self._without_pieces(parts))])
+        parts = self._settled(self._told_apart(self._without_pieces(parts)))
+        return self.going_somewhere([self._laid_alike(part) for part in parts])
 
     def going_somewhere(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, without those whose motion carries nothing as far as what moved was found from all the other state has.
@@ -343,6 +345,13 @@ class PartReview:
         """Which points of the other part lie in the box of the one, in the state in which the other was found."""
         box = self.pieces.box(one.points_in(other.state))
         return box.contains(torch.from_numpy(other.points), margin=3 * self.pieces.voxel)
+
+    def _told_apart(self, parts: list[MovingPart]) -> list[MovingPart]:
+        """The parts, those that are several which go nearly as far as these."""
+        done: list[MovingPart] = []
+        for index, part in enumerate(parts):
+            done += nearly_alike(part, self._again(part, [*done, *parts[index + 1 :]]), self.pieces)
+        return done
 
     def _settled(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts after a longer look at each and the ways it can lie, with the motions of the others as they now are."""

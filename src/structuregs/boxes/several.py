@@ -1,14 +1,16 @@
 """Whether what one motion puts in place best is several parts, by the ways along which its pieces would rather go."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from ..geometry import SE3, Screw, screw_at, straightened
 from ..joints import kind_of
 from .config import SearchConfig
 from .cue import Points
-from .divide import FACTORS, cut_across, divide, nearest_of
+from .divide import FACTORS, FINELY, cut_across, divide, nearest_of
 from .judge import Trial
 from .pieces import MovingPart, Pieces
 
@@ -35,11 +37,13 @@ def several_in(part: MovingPart, trial: Trial, pieces: Pieces, known_cut: bool) 
         pieces: all that moves.
         known_cut: whether the part is a piece of what was cut or divided.
     """
+    config = pieces.config
     ways, also = _ways(part, trial, pieces)
     shows = trial.shows(part.hypothesis)
-    if not shows or not is_unclear(part, trial, pieces.config):
+    if not shows or not is_unclear(part, trial, config):
         also = []
-    supports = [trial.there.support(trial.piece, _motions(*way)) for way in [*ways, *also]] if shows else [None] * len(ways)
+    tried = [_motions(way, FACTORS) for way in [*ways, *also]]
+    supports = [trial.there.support(trial.piece, motions) for motions in tried] if shows else [None] * len(ways)
     divisions = [_divided(part, trial, pieces, support) for support in supports if support is not None]
     best = max((division for division in divisions if len(division[0]) > 1), key=lambda division: division[1], default=None)
     if best is not None:
@@ -47,9 +51,10 @@ def several_in(part: MovingPart, trial: Trial, pieces: Pieces, known_cut: bool) 
     if known_cut:
         return [part.points]
     for way, support in zip(ways, supports, strict=False):  # not along what rivals add
-        cut = _cut(part, trial, pieces, way, support)
+        together = config.cut_shut if support is None else config.cut
+        cut = _cut(part, trial, way, FACTORS, support, pieces.voxel, together, config.cut)
         if len(cut) > 1:
-            return cut
+            return [part.points[within] for within, _ in cut]
     return [part.points]
 
 
@@ -72,9 +77,43 @@ def _ways(part: MovingPart, trial: Trial, pieces: Pieces) -> tuple[list[_Way], l
     return ways, also
 
 
-def _motions(screw: Screw, q: float) -> SE3:
+def nearly_alike(part: MovingPart, trial: Trial, pieces: Pieces) -> list[MovingPart]:
+    """A part as several that touch and go nearly as far along its way, such as doors above each other; or as it is.
+
+    So little of a difference is told only where the photos see all else in its place.
+
+    Args:
+        part: as it was found.
+        trial: the part between the photos, with all other parts in place.
+        pieces: all that moves.
+    """
+    config, motion = pieces.config, part.hypothesis.motion
+    screw, q = screw_at(motion, kind_of(motion), trial.box.T_world_box.xyz)
+    motions = _motions((screw, q), FINELY)
+    there = trial.there.support(trial.piece, motions)
+    cut = _cut(part, trial, (screw, q), FINELY, there, pieces.voxel, config.cut_finely, config.cut_finely)
+    if len(cut) == 1:
+        return [part]
+    found = []
+    for within, factor in cut:
+        inside = np.split(within, np.cumsum([len(points) for points in part.pieces])[:-1])
+        own = tuple(points[some] for points, some in zip(part.pieces, inside, strict=True) if some.any())
+        one = replace(part, pieces=own, hypothesis=trial.moved(part.hypothesis, motions[factor]), rivals=())
+        scene, splats = pieces.parted(pieces.held_by_part(one), one.state)
+        found.append(replace(one, weight=scene.needs(splats)))
+
+    def error(ways: list[SE3]) -> float:
+        return trial.apart((pieces.splats_of(one), pieces.box(one.points), way) for one, way in zip(found, ways, strict=True))
+
+    ways = [one.hypothesis.motion for one in found]
+    as_one = min(error([way] * len(found)) for way in [motion, *ways])
+    weights = sorted(one.weight for one in found)
+    return found if as_one - error(ways) > config.unlike * sum(weights[:-1]) else [part]
+
+
+def _motions(way: _Way, factors: tuple[float, ...]) -> SE3:
     """Less far and farther along a way."""
-    return screw.motion(q * torch.tensor(FACTORS, dtype=torch.float64))
+    return way[0].motion(way[1] * torch.tensor(factors, dtype=torch.float64))
 
 
 def _divided(part: MovingPart, trial: Trial, pieces: Pieces, support: Float64[np.ndarray, "F N"]) -> tuple[list[Points], float]:
@@ -86,15 +125,23 @@ def _divided(part: MovingPart, trial: Trial, pieces: Pieces, support: Float64[np
     return several, sum(float(support[:, nearest == k].sum(1).max()) for k in range(len(several)))
 
 
-def _cut(part: MovingPart, trial: Trial, pieces: Pieces, way: _Way, there: Float64[np.ndarray, "F N"] | None) -> list[Points]:
-    """The points of a part, cut across where its pieces had better go further or less far along one way."""
-    config, box, motions = pieces.config, trial.box, _motions(*way)
+def _cut(
+    part: MovingPart,
+    trial: Trial,
+    way: _Way,
+    factors: tuple[float, ...],
+    there: Float64[np.ndarray, "F N"] | None,
+    voxel: float,
+    together: float,
+    each: float,
+) -> list[tuple[Bool[np.ndarray, " P"], int]]:
+    """`cut_across` of a part's points, where its pieces had better go further or less far along one way."""
+    box, motions = trial.box, _motions(way, factors)
     others = trial.others.means.double()
-    fronts = trial.others[torch.stack([box.moved(motions[f]).contains(others) for f in range(len(FACTORS))]).any(0)]
+    fronts = trial.others[torch.stack([box.moved(motions[f]).contains(others) for f in range(len(factors))]).any(0)]
     support = trial.here.support(fronts, motions.inverse())
     places = box.moved(way[0].motion(way[1])).to_canonical(fronts.means.double()).numpy()
     if there is not None:
         support = np.concatenate([support, there], 1)
         places = np.concatenate([places, box.to_canonical(trial.piece.means.double()).numpy()])
-    together = config.cut_shut if there is None else config.cut
-    return cut_across(part.points, box, places, support, way[0], pieces.voxel, together)
+    return cut_across(part.points, box, places, support, way[0], voxel, together, each)
