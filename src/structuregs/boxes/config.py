@@ -24,9 +24,9 @@ class SearchConfig:
     cut_shut: float = 1.13
     """...and so many times, where only fronts show in the other state."""
     cut_finely: float = 1.02
-    """With all others in place it is cut where pieces that go nearly as far explain so many times as much..."""
+    """With all others in place it is cut in two where pieces that go nearly as far explain so many times as much..."""
     unlike: float = 0.1
-    """...if going as one costs the photos more than this fraction of the weight of all but the weightiest."""
+    """...if going as one costs the photos more than this fraction of the weight of the lesser."""
     clear_case: float = 1.0
     """A part that explains less than this share of its weight, of the 2 that it could of both states' photos, waits until the
     other state's clusters have been tried: it may be several."""

@@ -140,6 +140,7 @@ def cut_across(
     voxel: float,
     together: float,
     each: float,
+    again: bool = True,
 ) -> list[tuple[Bool[np.ndarray, " P"], int]]:
     """The points of one cluster, cut where pieces of it would rather go ways of their own along its motion.
 
@@ -155,6 +156,7 @@ def cut_across(
         voxel: of the hull, world units.
         together: the pieces must explain so many times what they do as one...
         each: ...and every cut so many times what was explained before it.
+        again: whether the pieces are cut in their turn.
 
     Returns:
         Of each piece, which points are its own, and the index of the factor that suits it.
@@ -165,7 +167,7 @@ def cut_across(
     axes = [int(axis) for axis in torch.nonzero(unmoved & wide).flatten()]
     common = float(support.sum(1).max())
     local = box.to_canonical(torch.from_numpy(points)).numpy()
-    pieces = _cut(places, support, local, axes, each, (_EACH * common, _EACH * len(local)))
+    pieces = _cut(places, support, local, axes, each, (_EACH * common, _EACH * len(local)), again)
     if sum(float(reached.max()) for _, reached in pieces) < together * common:
         pieces = [(_everywhere(), support.sum(1))]
     within = [np.all((local > low) & (local <= high), axis=1) for (low, high), _ in pieces]
@@ -183,6 +185,7 @@ def _cut(
     axes: list[int],
     better: float,
     least: tuple[float, float],
+    again: bool,
 ) -> list[tuple[Float64[np.ndarray, "2 3"], Float64[np.ndarray, " F"]]]:
     """Lowest and highest corner of the pieces that had each better move by itself, and what each reaches for each factor.
 
@@ -193,6 +196,7 @@ def _cut(
         axes: across which cuts are allowed.
         better: how many times as much as before is reached after a cut.
         least: what each piece must reach, and how many points it must hold.
+        again: whether the pieces are cut in their turn.
     """
     best, found = better * float(support.sum(1).max()), None
     for axis in axes:
@@ -209,8 +213,9 @@ def _cut(
         return [(_everywhere(), support.sum(1))]
     axis, level = found
     low, under = fronts[:, axis] <= level, points[:, axis] <= level
-    below = _cut(fronts[low], support[:, low], points[under], axes, better, least)
-    above = _cut(fronts[~low], support[:, ~low], points[~under], axes, better, least)
+    axes = axes if again else []
+    below = _cut(fronts[low], support[:, low], points[under], axes, better, least, again)
+    above = _cut(fronts[~low], support[:, ~low], points[~under], axes, better, least, again)
     for bounds, _ in below:
         bounds[1, axis] = min(bounds[1, axis], level)
     for bounds, _ in above:

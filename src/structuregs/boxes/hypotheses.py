@@ -93,13 +93,17 @@ def square_with(box: Box, axis: int, base: Box) -> Float64[Tensor, "3 3"] | None
         axis: which of its axes stays; of the base's axes, another comes to lie along the one most at right angles to it.
         base: the base's box.
     """
-    own, others = box.T_world_box.rotation, base.T_world_box.rotation
-    stays = own[:, axis]
-    across = others[:, int((stays @ others).abs().argmin())]
-    across = torch.nn.functional.normalize(across - (across @ stays) * stays, dim=0)
-    if float((across @ own).abs().max()) > _ALONG:
-        return None
-    return torch.stack([stays, across, torch.linalg.cross(stays, across)], 1)
+    own = box.T_world_box.rotation
+    axes = square_about(own[:, axis], base)
+    return None if float((axes[:, 1] @ own).abs().max()) > _ALONG else axes
+
+
+def square_about(axis: Float64[Tensor, "3"], base: Box) -> Float64[Tensor, "3 3"]:
+    """A unit vector and what lies square with it and the base, as columns: of the base's axes the one most at right angles."""
+    others = base.T_world_box.rotation
+    across = others[:, int((axis @ others).abs().argmin())]
+    across = torch.nn.functional.normalize(across - (across @ axis) * axis, dim=0)
+    return torch.stack([axis, across, torch.linalg.cross(axis, across)], 1)
 
 
 def registrations(box: Box, target: Box) -> list[SE3]:

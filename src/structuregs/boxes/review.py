@@ -348,9 +348,14 @@ class PartReview:
 
     def _told_apart(self, parts: list[MovingPart]) -> list[MovingPart]:
         """The parts, those that are several which go nearly as far as these."""
-        done: list[MovingPart] = []
-        for index, part in enumerate(parts):
-            done += nearly_alike(part, self._again(part, [*done, *parts[index + 1 :]]), self.pieces)
+        left, done = list(parts), []
+        while left:
+            part = left.pop(0)
+            several = nearly_alike(part, self._again(part, [*done, *left]), self.pieces)
+            if len(several) > 1:
+                left = several + left
+            else:
+                done.append(part)
         return done
 
     def _settled(self, parts: list[MovingPart]) -> list[MovingPart]:

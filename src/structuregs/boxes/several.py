@@ -4,17 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
-from ..geometry import SE3, Screw, screw_at, straightened
+from ..geometry import SE3, Box, Screw, screw_at, straightened
 from ..joints import kind_of
 from .config import SearchConfig
-from .cue import Points
+from .cue import Points, box_around
 from .divide import FACTORS, FINELY, cut_across, divide, nearest_of
+from .hypotheses import square_about
 from .judge import Trial
 from .pieces import MovingPart, Pieces
 
 _ALIGNED = 0.9998  # cosine between two axes: a degree
+_CRUMB = 0.1  # of the weight of two that go nearly as far: what has less is a crumb of something else
 
 _Way = tuple[Screw, float]
 
@@ -37,10 +39,9 @@ def several_in(part: MovingPart, trial: Trial, pieces: Pieces, known_cut: bool) 
         pieces: all that moves.
         known_cut: whether the part is a piece of what was cut or divided.
     """
-    config = pieces.config
     ways, also = _ways(part, trial, pieces)
     shows = trial.shows(part.hypothesis)
-    if not shows or not is_unclear(part, trial, config):
+    if not shows or not is_unclear(part, trial, pieces.config):
         also = []
     tried = [_motions(way, FACTORS) for way in [*ways, *also]]
     supports = [trial.there.support(trial.piece, motions) for motions in tried] if shows else [None] * len(ways)
@@ -51,10 +52,9 @@ def several_in(part: MovingPart, trial: Trial, pieces: Pieces, known_cut: bool) 
     if known_cut:
         return [part.points]
     for way, support in zip(ways, supports, strict=False):  # not along what rivals add
-        together = config.cut_shut if support is None else config.cut
-        cut = _cut(part, trial, way, FACTORS, support, pieces.voxel, together, config.cut)
+        cut = _cut(part, trial, pieces, way, support)
         if len(cut) > 1:
-            return [part.points[within] for within, _ in cut]
+            return cut
     return [part.points]
 
 
@@ -78,7 +78,7 @@ def _ways(part: MovingPart, trial: Trial, pieces: Pieces) -> tuple[list[_Way], l
 
 
 def nearly_alike(part: MovingPart, trial: Trial, pieces: Pieces) -> list[MovingPart]:
-    """A part as several that touch and go nearly as far along its way, such as doors above each other; or as it is.
+    """A part as two that touch and go nearly as far along its way, such as doors above each other; or as it is.
 
     So little of a difference is told only where the photos see all else in its place.
 
@@ -91,7 +91,11 @@ def nearly_alike(part: MovingPart, trial: Trial, pieces: Pieces) -> list[MovingP
     screw, q = screw_at(motion, kind_of(motion), trial.box.T_world_box.xyz)
     motions = _motions((screw, q), FINELY)
     there = trial.there.support(trial.piece, motions)
-    cut = _cut(part, trial, (screw, q), FINELY, there, pieces.voxel, config.cut_finely, config.cut_finely)
+    axes = square_about(screw.axis, pieces.base_box)
+    frame = box_around(part.points, 0.5 * pieces.voxel, axes=axes)  # the least box around doors ajar may lie askew
+    support, places = _asked(trial, frame, (screw, q), FINELY, there)
+    least = config.cut_finely
+    cut = cut_across(part.points, frame, places, support, screw, pieces.voxel, least, least, again=False)
     if len(cut) == 1:
         return [part]
     found = []
@@ -107,8 +111,10 @@ def nearly_alike(part: MovingPart, trial: Trial, pieces: Pieces) -> list[MovingP
 
     ways = [one.hypothesis.motion for one in found]
     as_one = min(error([way] * len(found)) for way in [motion, *ways])
-    weights = sorted(one.weight for one in found)
-    return found if as_one - error(ways) > config.unlike * sum(weights[:-1]) else [part]
+    weights = [one.weight for one in found]
+    if min(weights) < _CRUMB * sum(weights) or as_one - error(ways) < config.unlike * min(weights):
+        return [part]
+    return found
 
 
 def _motions(way: _Way, factors: tuple[float, ...]) -> SE3:
@@ -125,23 +131,35 @@ def _divided(part: MovingPart, trial: Trial, pieces: Pieces, support: Float64[np
     return several, sum(float(support[:, nearest == k].sum(1).max()) for k in range(len(several)))
 
 
-def _cut(
-    part: MovingPart,
-    trial: Trial,
-    way: _Way,
-    factors: tuple[float, ...],
-    there: Float64[np.ndarray, "F N"] | None,
-    voxel: float,
-    together: float,
-    each: float,
-) -> list[tuple[Bool[np.ndarray, " P"], int]]:
-    """`cut_across` of a part's points, where its pieces had better go further or less far along one way."""
+def _cut(part: MovingPart, trial: Trial, pieces: Pieces, way: _Way, there: Float64[np.ndarray, "F N"] | None) -> list[Points]:
+    """The points of a part, cut across where its pieces had better go further or less far along one way."""
+    config = pieces.config
+    support, places = _asked(trial, trial.box, way, FACTORS, there)
+    together = config.cut_shut if there is None else config.cut
+    cut = cut_across(part.points, trial.box, places, support, way[0], pieces.voxel, together, config.cut)
+    return [part.points[within] for within, _ in cut]
+
+
+def _asked(
+    trial: Trial, frame: Box, way: _Way, factors: tuple[float, ...], there: Float64[np.ndarray, "F N"] | None
+) -> tuple[Float64[np.ndarray, "F M"], Float64[np.ndarray, "M 3"]]:
+    """What splats say for each of some factors of a part's way, and where in a box around the part they are.
+
+    These are the splats of what shows in the other state where the part may be, brought back, and the part's own.
+
+    Args:
+        trial: the part between the photos.
+        frame: the box.
+        way: the part's.
+        factors: of it.
+        there: what the part's own splats say; None if the other state does not show them.
+    """
     box, motions = trial.box, _motions(way, factors)
     others = trial.others.means.double()
     fronts = trial.others[torch.stack([box.moved(motions[f]).contains(others) for f in range(len(factors))]).any(0)]
     support = trial.here.support(fronts, motions.inverse())
-    places = box.moved(way[0].motion(way[1])).to_canonical(fronts.means.double()).numpy()
-    if there is not None:
-        support = np.concatenate([support, there], 1)
-        places = np.concatenate([places, box.to_canonical(trial.piece.means.double()).numpy()])
-    return cut_across(part.points, box, places, support, way[0], voxel, together, each)
+    places = frame.moved(way[0].motion(way[1])).to_canonical(fronts.means.double()).numpy()
+    if there is None:
+        return support, places
+    own = frame.to_canonical(trial.piece.means.double()).numpy()
+    return np.concatenate([support, there], 1), np.concatenate([places, own])
