@@ -16,7 +16,7 @@ from .judge import Trial
 from .pieces import MovingPart, Pieces
 
 _ALIGNED = 0.9998  # cosine between two axes: a degree
-_CRUMB = 0.1  # of the weight of two that go nearly as far: what has less is a crumb of something else
+_CRUMB = 0.2  # of the weight of two that go nearly as far: what has less is a crumb of something else
 
 _Way = tuple[Screw, float]
 
