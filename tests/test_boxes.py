@@ -25,6 +25,7 @@ from structuregs.boxes import (
     survey,
 )
 from structuregs.boxes.appearance import LOOK_DILATION, AppearanceConfig
+from structuregs.boxes.cue import Cluster
 from structuregs.boxes.divide import AROUND, FACTORS, cut_across, divide, moving_along
 from structuregs.boxes.hypotheses import (
     Hypothesis,
@@ -925,6 +926,28 @@ class TestPartsThatGoNearlyAsFar:
     def test_each_stays_what_it_is(self):
         review, _, parts = doors_as_one(50.0, 56.0)
         assert review._told_apart(parts) == parts
+
+
+class TestWhereAPartLies:
+    def test_what_is_between_pieces_far_apart_is_not_theirs(self):
+        """Two drawers that come out alike, on either side of a cupboard, and a door between them."""
+        (part,) = parts_of("laptop")
+        pieces = Pieces(looks_of("laptop")[1], SMALL.search, seed=0)
+        cube = points_of(Box(NO_MOTION, torch.full((3,), 0.2, dtype=F64)), 500)
+        aside = np.array([1.0, 0, 0])
+        left, right, middle = cube - aside, cube + aside, Cluster(part.state, cube)
+        apart = replace(part, pieces=(left, right))
+        assert not pieces.within(apart, middle).any()
+        for points in (left, right):
+            assert pieces.within(apart, Cluster(part.state, points)).all()
+        rail = points_of(Box(NO_MOTION, torch.tensor([0.9, 0.2, 0.01], dtype=F64)), 500)
+        assert pieces.within(replace(part, pieces=(left, right, rail)), middle).all(), "what lies together lies in one box"
+
+    def test_it_goes_where_the_part_goes(self):
+        (part,) = parts_of("laptop")
+        pieces = Pieces(looks_of("laptop")[1], SMALL.search, seed=0)
+        there = Cluster(1 - part.state, part.points_in(1 - part.state))
+        assert pieces.within(part, there).double().mean() > 0.95
 
 
 class TestReview:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -230,10 +231,24 @@ class Pieces:
         return points if len(points) <= most else points[self.generator.choice(len(points), most, replace=False)]
 
     def within(self, part: MovingPart, cluster: Cluster) -> Bool[Tensor, " P"]:
-        """Which points of a cluster of either state lie where the part is in that state."""
-        box = self.box(part.points)
-        there = box if cluster.state == part.state else box.moved(part.hypothesis.motion)
-        return there.contains(torch.from_numpy(cluster.points), margin=3 * self.voxel)
+        """Which points of a cluster of either state lie where the part is in that state.
+
+        One box around pieces that lie apart, as two drawers do that come out alike, would hold what is between them.
+        """
+        points = torch.from_numpy(cluster.points)
+        inside = torch.zeros(len(points), dtype=torch.bool)
+        for lump in self._lumps(part):
+            box = self.box(lump)
+            there = box if cluster.state == part.state else box.moved(part.hypothesis.motion)
+            inside |= there.contains(points, margin=3 * self.voxel)
+        return inside
+
+    def _lumps(self, part: MovingPart) -> list[Points]:
+        """A part's points, in its own state, by what of its pieces lies together."""
+        near, trees = (self.config.cue.link + self.config.clear) * self.voxel, [KDTree(points) for points in part.pieces]
+        beside = [[a is b or a.query(b.data, distance_upper_bound=near)[0].min() < near for a in trees] for b in trees]
+        count, lump = connected_components(np.array(beside))
+        return [np.concatenate([part.pieces[i] for i in np.flatnonzero(lump == k)]) for k in range(count)]
 
     def explained_by(self, part: MovingPart) -> set[int]:
         """Clusters of either state that lie where the part is in that state."""
