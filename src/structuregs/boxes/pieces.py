@@ -231,29 +231,29 @@ class Pieces:
         return points if len(points) <= most else points[self.generator.choice(len(points), most, replace=False)]
 
     def within(self, part: MovingPart, cluster: Cluster) -> Bool[Tensor, " P"]:
-        """Which points of a cluster of either state lie where the part is in that state.
-
-        One box around pieces that lie apart, as two drawers do that come out alike, would hold what is between them.
-        """
-        points = torch.from_numpy(cluster.points)
-        inside = torch.zeros(len(points), dtype=torch.bool)
-        for lump in self._lumps(part):
-            box = self.box(lump)
-            there = box if cluster.state == part.state else box.moved(part.hypothesis.motion)
-            inside |= there.contains(points, margin=3 * self.voxel)
-        return inside
-
-    def _lumps(self, part: MovingPart) -> list[Points]:
-        """A part's points, in its own state, by what of its pieces lies together."""
-        near, trees = (self.config.cue.link + self.config.clear) * self.voxel, [KDTree(points) for points in part.pieces]
-        beside = [[a is b or a.query(b.data, distance_upper_bound=near)[0].min() < near for a in trees] for b in trees]
-        count, lump = connected_components(np.array(beside))
-        return [np.concatenate([part.pieces[i] for i in np.flatnonzero(lump == k)]) for k in range(count)]
+        """Which points of a cluster of either state lie where the part is in that state."""
+        return self._in_any(self._lying(part)[cluster.state], cluster)
 
     def explained_by(self, part: MovingPart) -> set[int]:
         """Clusters of either state that lie where the part is in that state."""
-        clusters = enumerate(self.clusters)
-        return {index for index, cluster in clusters if float(self.within(part, cluster).double().mean()) > 0.6}
+        boxes, clusters = self._lying(part), enumerate(self.clusters)
+        return {i for i, cluster in clusters if float(self._in_any(boxes[cluster.state], cluster).double().mean()) > 0.6}
+
+    def _lying(self, part: MovingPart) -> dict[int, list[Box]]:
+        """The boxes around what of a part's pieces lies together, by state.
+
+        One box around pieces that lie apart, as two drawers do that come out alike, would hold what is between them.
+        """
+        near, trees = (self.config.cue.link + self.config.clear) * self.voxel, [KDTree(points) for points in part.pieces]
+        beside = [[a is b or a.query(b.data, distance_upper_bound=near)[0].min() < near for a in trees] for b in trees]
+        count, lump = connected_components(np.array(beside))
+        own = [self.box(np.concatenate([part.pieces[i] for i in np.flatnonzero(lump == k)])) for k in range(count)]
+        return {part.state: own, 1 - part.state: [box.moved(part.hypothesis.motion) for box in own]}
+
+    def _in_any(self, boxes: list[Box], cluster: Cluster) -> Bool[Tensor, " P"]:
+        """Which points of a cluster lie in any of some boxes, or near it."""
+        points = torch.from_numpy(cluster.points)
+        return torch.stack([box.contains(points, margin=3 * self.voxel) for box in boxes]).any(0)
 
 
 def _in_both(one: Points, two: Points, gap: float) -> Points:
