@@ -98,16 +98,17 @@ def nearly_alike(part: MovingPart, trial: Trial, pieces: Pieces) -> list[MovingP
     cut = cut_across(part.points, frame, places, support, screw, pieces.voxel, least, least, again=False)
     if len(cut) == 1:
         return [part]
-    found = []
+    found, placed = [], []
     for within, factor in cut:
         inside = np.split(within, np.cumsum([len(points) for points in part.pieces])[:-1])
         own = tuple(points[some] for points, some in zip(part.pieces, inside, strict=True) if some.any())
         one = replace(part, pieces=own, hypothesis=trial.moved(part.hypothesis, motions[factor]), rivals=())
         scene, splats = pieces.parted(pieces.held_by_part(one), one.state)
         found.append(replace(one, weight=scene.needs(splats)))
+        placed.append((splats, pieces.box(one.points)))
 
     def error(ways: list[SE3]) -> float:
-        return trial.apart((pieces.splats_of(one), pieces.box(one.points), way) for one, way in zip(found, ways, strict=True))
+        return trial.apart((*piece, way) for piece, way in zip(placed, ways, strict=True))
 
     ways = [one.hypothesis.motion for one in found]
     as_one = min(error([way] * len(found)) for way in [motion, *ways])
